@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import RmpaError
-from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.goals import (
     GoalId,
     GoalState,
@@ -21,6 +20,7 @@ from rmpa.gateway.ros2.goals import (
     ros2_states,
     with_uuid,
 )
+from rmpa.gateway.ros2.pairs import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
@@ -51,21 +51,12 @@ SEEDS: list[bytes] = [
 class _Out:
     """Counts what the goals do."""
 
-    pair = _PAIR
     done = 0
 
     def tell_ros1(self, *_: object) -> None:
         self.done += 1
 
     tell_ros2 = ask = answer = tell_ros1
-
-
-class _ToRos2(_Out, GoalsToRos2):
-    pass
-
-
-class _ToRos1(_Out, GoalsToRos1):
-    pass
 
 
 class _Query:
@@ -81,7 +72,8 @@ class _Query:
 def fuzz(data: bytes) -> None:
     """What is read is written as it was; machines take all bytes, or refuse them with a documented error."""
     query: Any = _Query(data)
-    to_ros2, to_ros1 = _ToRos2(SystemClock()), _ToRos1(SystemClock())
+    out: Any = _Out()
+    to_ros2, to_ros1 = GoalsToRos2(out, _PAIR, SystemClock()), GoalsToRos1(out, _PAIR, SystemClock())
     takes: list[Callable[[Any], object]] = [
         to_ros2.goal, to_ros2.cancel, to_ros2.feedback, to_ros2.status, to_ros1.status, to_ros1.feedback,
         to_ros1.result, lambda raw: to_ros2.answered("get_result", _UUID, raw),
@@ -95,7 +87,7 @@ def fuzz(data: bytes) -> None:
         except RmpaError as error:
             if not str(error).isprintable():
                 raise AssertionError("an error's text is not safe to log") from error
-    if to_ros1.done + to_ros2.done > 12:
+    if out.done > 12:
         raise AssertionError("one message made many")
     _round_trips(data)
 

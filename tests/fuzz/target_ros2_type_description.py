@@ -7,10 +7,10 @@ from typing import Any
 from rosbags.typesys.base import TypesysError
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.gateway.ros2.asking import parse_type_response
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.pairs import Ros2Pairs, TypeMapping, derive_service, described_types
-from rmpa.gateway.ros2.services import ServicePair
-from rmpa.gateway.ros2.types import Ros2Types, TypePair, parse_type_response
+from rmpa.gateway.ros2.pairs import Ros2Pairs, ServicePair, TypeMapping, derive_service, described_types
+from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType

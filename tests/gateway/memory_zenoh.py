@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply, ZenohSample
+from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
 from rmpa.ros.wire.tcpros import Buffer
 
 
@@ -68,17 +68,17 @@ class MemoryPublisher(Entry):
     sent: int = 0
     dropped = waiting = 0
 
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
+    def put(self, payload: Buffer, attachment: bytes = b"") -> None:
         self.sent += 1
-        sample = ZenohSample(self.key, bytes(payload), attachment)
+        sample = ZenohSample(bytes(payload), attachment)
         self.cached = [*self.cached, sample][-self.cache :] if self.cache else []
         for each in self.session.network.subscribers:
-            if fits(each.key, sample.key):
+            if fits(each.key, self.key):
                 each.call(sample)
-        return 0
 
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        return sum(self.put(*each) for each in messages)
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        for message in messages:
+            self.put(*message)
 
 
 @dataclass
@@ -90,18 +90,18 @@ class MemoryQuery:
     attachment: bytes
     parameters: str
     done: asyncio.Event = field(default_factory=asyncio.Event)
-    replies: list[ZenohReply] = field(default_factory=list)
+    replies: list[ZenohSample] = field(default_factory=list)
 
-    def reply(self, key: str, payload: Buffer, attachment: bytes = b"") -> None:
-        self.replies.append(ZenohReply(key, bytes(payload), attachment, True))
-
-    def answer(self, payload: Buffer) -> None:
-        """Give the only answer, with the attachment of the query."""
-        self.reply(self.key, payload, self.attachment)
+    def reply(self, payload: Buffer, attachment: bytes = b"") -> None:
+        self.replies.append(ZenohSample(bytes(payload), attachment))
         self.finish()
 
+    def answer(self, payload: Buffer) -> None:
+        """Answer with the attachment of the query."""
+        self.reply(payload, self.attachment)
+
     def reply_error(self, text: str) -> None:
-        self.replies.append(ZenohReply("", text.encode(), b"", False))
+        self.replies.append(ZenohSample(text.encode(), ok=False))
         self.finish()
 
     def finish(self) -> None:
@@ -181,7 +181,7 @@ class MemorySession:
 
     async def get(
         self, selector: str, payload: Buffer = b"", attachment: bytes = b"", *, timeout: float = 5.0, **_terms: object
-    ) -> list[ZenohReply]:
+    ) -> list[ZenohSample]:
         key, _, parameters = selector.partition("?")
         asked = [entry for entry in self.network.queryables if fits(key, entry.key)]
         queries = [MemoryQuery(key, bytes(payload), attachment, parameters) for _ in asked]

@@ -10,6 +10,7 @@ import pytest
 
 from rmpa.gateway.zenoh.config import ZenohConfig
 from rmpa.gateway.zenoh.session import OpenSession, open_session
+from rmpa.gateway.zenoh.threads import QueuedPublisher
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 
@@ -20,6 +21,11 @@ def free_port() -> int:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def put(publisher: QueuedPublisher, payload: bytes, attachment: bytes = b"") -> None:
+    """Publish one message."""
+    publisher.put_all([(payload, attachment)])
 
 
 class ZenohBed:

@@ -14,7 +14,7 @@ import pytest
 
 from lab.bed.gateways import ROUTER_PORT, python_of
 from lab.bed.processes import Event, Process, eventually
-from rmpa.gateway.ros2.conversion import ActionPair
+from rmpa.gateway.ros2.pairs import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from tests.interop.ros import lacks

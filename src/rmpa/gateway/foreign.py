@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.gateway.rules import SourceKey
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import ArrivedQuery
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
@@ -66,8 +66,7 @@ class Answering(OwnedTasks):
 
     async def _answer(self, query: ArrivedQuery, respond: Respond) -> None:
         try:
-            query.reply(query.key, *(await respond(query)))
-            query.finish()
+            query.reply(*(await respond(query)))
         except PeerRefused as error:
             query.reply_error(error.reason)
         except RmpaError as error:
@@ -274,6 +273,7 @@ class ProxiedTopic(ProxiedSource, PublicationEvents):
         self._on_demand = on_demand
         self._wanted = False
         self._publication = Publication(source.name, self._offered.node, events=self)
+        site.show(self)
 
     def describe(self, description: TopicDescription) -> None:
         """Set type, md5 sum, definition and latching; subscribers of another definition are disconnected."""
@@ -359,6 +359,7 @@ class ProxiedService(ProxiedSource):
             timeout=timeout,
             on_mismatch=self._mismatched,
         )
+        site.show(self)
 
     def make_room(self) -> None:
         """Leave the name to a module's service, until that one has gone."""

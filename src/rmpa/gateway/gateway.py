@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
+    from rmpa.gateway.ros2.graph import Ros2Link
     from rmpa.gateway.ros2.rclpy_session import RclpySession
     from rmpa.gateway.rules import Neighbour
     from rmpa.gateway.zenoh.session import OpenSession
@@ -65,7 +66,7 @@ class Gateway:
     ) -> None:
         self._settings = _own(settings)
         self._open_session = open_session
-        self._make_neighbours = make_neighbours or _make_neighbours
+        self._make_neighbours = make_neighbours or self._make
         self.agent = Agent(self._settings, realtime, load)
         self.graph = AgentGraph(self.agent, self._settings)
         self.agent.bridge.add(self.graph)
@@ -74,7 +75,7 @@ class Gateway:
         self.graph.reloaded = self._reloaded
         if self.agent.trust is not None:
             self.agent.trust.membership.on_denied.append(self._denied)
-        self.session: OpenSession | RclpySession | None = None
+        self.session: Ros2Link | None = None
         self.ros2: RclpySession | None = None
         self.neighbours: dict[str, Neighbour] = {}
         self._problem = ""
@@ -125,7 +126,7 @@ class Gateway:
         await self.graph.end()
         await self.agent.close()
 
-    async def _open(self) -> OpenSession | RclpySession:
+    async def _open(self) -> Ros2Link:
         gateway = self._settings.gateway
         if gateway.via_rclpy and self.ros2 is None:
             from rmpa.gateway.ros2.ros2 import open_rclpy_session  # noqa: PLC0415 - not every gateway needs it
@@ -181,7 +182,7 @@ class Gateway:
                 async with self._leaving:
                     await self._leave(self.session)
 
-    async def _leave(self, session: OpenSession | RclpySession) -> None:
+    async def _leave(self, session: Ros2Link) -> None:
         self._changed.clear()
         await self._close_neighbours()
         self.graph.unwatch()
@@ -219,21 +220,34 @@ class Gateway:
         elif self.session is not None and self._settings.gateway.connect and not self.session.endpoints:
             yield f"gateway: no router is connected; it is to be at {', '.join(self._settings.gateway.connect)}"
 
-    def _join(self, session: OpenSession | RclpySession) -> None:
+    def _join(self, session: Ros2Link) -> None:
         self.session = session
         self._problem = ""
         self.neighbours = dict(self._make_neighbours(self.graph, session, self._settings))
-        if self._settings.gateway.ros2.enabled and "ros2" not in self.neighbours:
-            from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
-
-            self.neighbours["ros2"] = make_ros2_neighbour(self.graph, self.ros2 or session, self._settings)
         for neighbour in self.neighbours.values():
             neighbour.start()
         self._join_others(session)
         way = "rclpy" if session is self.ros2 else "zenoh"
         _log.info("= joined: %s; %s session %s", ", ".join(self.neighbours) or "none", way, session.zid)
 
-    def _join_others(self, session: OpenSession | RclpySession) -> None:
+    def _make(self, graph: AgentGraph, session: Any, settings: Settings) -> dict[str, Neighbour]:
+        """Make the neighbours that the settings ask for, by their names; they are not started.
+
+        Raises:
+            ConfigError: A setting of one is wrong.
+        """
+        neighbours: dict[str, Neighbour] = {}
+        if settings.gateway.site:
+            from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
+
+            neighbours["sites"] = make_site_neighbour(graph, session, settings)
+        if settings.gateway.ros2.enabled:
+            from rmpa.gateway.ros2.ros2 import make_ros2_neighbour  # noqa: PLC0415 - it reads all types of ROS
+
+            neighbours["ros2"] = make_ros2_neighbour(graph, self.ros2 or session, settings)
+        return neighbours
+
+    def _join_others(self, session: Ros2Link) -> None:
         """Make and start the neighbours of other packages; one that fails is logged, and left out."""
         for entry, make in load_plugins(NEIGHBOURS):
             try:
@@ -249,7 +263,7 @@ class Gateway:
             self._problem = str(error)
             _log.warning("! %s; it is tried again [zenoh-trouble]", error)
 
-    def _try_to_join(self, session: OpenSession | RclpySession) -> None:
+    def _try_to_join(self, session: Ros2Link) -> None:
         """Makes the neighbours while the gateway runs: what is wrong with them is told, and ends nothing else."""
         try:
             self._join(session)
@@ -272,25 +286,10 @@ def _rules(settings: Settings) -> tuple[object, ...]:
     return settings.gateway.rules, policy, settings.contracts, (trust.default, trust.groups, trust.rules)
 
 
-async def _discard(opening: asyncio.Future[OpenSession | RclpySession]) -> None:
+async def _discard(opening: asyncio.Future[Ros2Link]) -> None:
     """Closes a session that is not needed any more, once it is open."""
     with contextlib.suppress(StartError):
         await (await opening).close()
-
-
-def _make_neighbours(graph: AgentGraph, session: Any, settings: Settings) -> dict[str, Neighbour]:
-    """Make the neighbours that the settings ask for, by their names; they are not started.
-
-    Raises:
-        ConfigError: A setting of one is wrong.
-    """
-    neighbours: dict[str, Neighbour] = {}
-    gateway = settings.gateway
-    if gateway.site:
-        from rmpa.gateway.sites.answers import make_site_neighbour  # noqa: PLC0415 - not every gateway needs it
-
-        neighbours["sites"] = make_site_neighbour(graph, session, settings)
-    return neighbours
 
 
 async def _main(

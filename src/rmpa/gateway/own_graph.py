@@ -56,21 +56,22 @@ class MeshSources:
     Args:
         agent: The gateway's agent.
         name: Its name among its peers.
-
-    Attributes:
-        known: The sources that were reported.
     """
 
     def __init__(self, agent: Agent, name: str) -> None:
         self._agent = agent
         self._name = name
         self._relay = agent.bridge.relay
-        self.known: dict[SourceKey, MeshSource] = {}
         self.watchers: list[Callable[[MeshSource, bool], None]] = []
         self._by_name: dict[tuple[SourceKind, str], dict[SourceKey, MeshSource]] = {}
         self._changed: dict[tuple[SourceKind, str], None] = {}
         self._soon: asyncio.Handle | None = None
         self._begun = False
+
+    @property
+    def reported(self) -> list[MeshSource]:
+        """The sources that there are, as they were reported."""
+        return [source for found in self._by_name.values() for source in found.values()]
 
     def begin(self) -> None:
         """Begin to report; the agent's place in the network is known."""
@@ -114,11 +115,9 @@ class MeshSources:
                 self._by_name[kind, name] = found
             for key, source in before.items():
                 if found.get(key) != source:
-                    del self.known[key]
                     self._tell(source, there=False)
             for key, source in found.items():
                 if before.get(key) != source:
-                    self.known[key] = source
                     self._tell(source, there=True)
 
     def _tell(self, source: MeshSource, *, there: bool) -> None:
@@ -172,8 +171,6 @@ class AgentGraph(Part):
         name: The gateway's name among its peers.
         reloaded: Called with other rules, after the graph has taken them.
         node: The node that taps topics.
-        sources: The local sources by kind, name here and node here. What came from a neighbour is not among
-            them.
     """
 
     def __init__(self, agent: Agent, settings: Settings) -> None:
@@ -183,7 +180,6 @@ class AgentGraph(Part):
         self._core = agent.core
         self._sources = MeshSources(agent, settings.name)
         self._sources.watchers.append(self._source_changed)
-        self.sources: Final = self._sources.known
         agent.services.make_room = self._make_room
         self._taps: dict[str, set[TopicTap]] = {}
         self._pools: dict[str, ServicePool] = {}
@@ -200,7 +196,7 @@ class AgentGraph(Part):
     def watch(self, on_change: Callable[[MeshSource, bool], None]) -> None:
         """Call ``on_change(source, there)`` for each source that is there now, and at each change."""
         self._sources.watchers.append(on_change)
-        for source in list(self.sources.values()):
+        for source in self._sources.reported:
             on_change(source, True)
 
     def tap(
@@ -278,10 +274,7 @@ class AgentGraph(Part):
             source: The topic.
             on_demand: ``(wanted)``: a first node or module has subscribed, or the last one has left.
         """
-        site = self._site(source)
-        shown = ProxiedTopic(source, site, on_demand)
-        site.show(shown)
-        return shown
+        return ProxiedTopic(source, self._site(source), on_demand)
 
     def show_service(
         self,
@@ -296,10 +289,7 @@ class AgentGraph(Part):
             serve: Awaited with each request for its response; an ``RmpaError`` is the client's error.
             describe: Awaited once a client or a module asks for its type; an ``RmpaError`` is the client's error.
         """
-        site = self._site(source)
-        shown = ProxiedService(source, site, serve, describe)
-        site.show(shown)
-        return shown
+        return ProxiedService(source, self._site(source), serve, describe)
 
     async def begin(self) -> None:
         """Begin to follow the graph, once the agent has started and its place in the network is known."""

@@ -1,23 +1,25 @@
-"""One publisher of this mesh for other sites or for ROS 2; what differs between these is an ``ExportDialect``."""
+"""One publisher of this mesh for a neighbour: demand, limits, numbers. Sites and ROS 2 have forms of their own."""
 
 from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from functools import partial
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.timers import TokenBucket
 from rmpa.gateway import limits
 from rmpa.observe.check import OK, WARN, Check
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.stream import after_read
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
-    from rmpa.gateway.ros2.link import Publishing, Ros2Link
+    from rmpa.gateway.ros2.graph import Publishing, Ros2Link
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import TopicDescription
@@ -31,41 +33,6 @@ _COLLECTED_MESSAGES: Final = 256
 
 # Seconds by which a timer may be early.
 _BOUNDARY = 0.001
-
-
-class ExportDialect(Protocol):
-    """How one topic is announced to a kind of neighbour, and how its messages are written."""
-
-    def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
-        """The key and the QoS to publish by; ``None``: the publisher has to be asked for its header first.
-
-        Args:
-            about: The publisher's header; ``None`` while it is not known.
-            latched: Whether a late subscriber is to get its last message.
-            large: Whether its messages are large.
-
-        Raises:
-            RmpaError: It cannot cross; the text says why.
-        """
-
-    def payload(self, body: memoryview) -> bytes | None:
-        """A message in the neighbour's form; ``None``: it has none, and is left out."""
-
-    def attachment(self, sequence: int, stamp: int) -> bytes:
-        """What goes with a message: its number from 1, and when it came, in nanoseconds since 1970."""
-
-    def linger(self, *, keeps: bool) -> float | None:
-        """Seconds for which its publisher stays connected without demand; ``None``: for good.
-
-        Args:
-            keeps: Whether its last message is kept for late subscribers, of which one has come.
-        """
-
-    def say(self, problem: str) -> None:
-        """Why its messages do not cross has changed; empty for nothing."""
-
-    def close(self) -> None:
-        """Take the announcement back."""
 
 
 def flow(stage: str, text: str, messages: int, losses: Iterable[tuple[int, str]], remedy: str = "") -> Check:
@@ -112,10 +79,10 @@ class TopicLimits:
             yield self._size, size
 
 
-class ExportedTopic:
-    """Subscribes to one local publisher while there is demand, and puts its messages to Zenoh.
+class ExportedTopic(ABC):
+    """Subscribes to one local publisher while there is demand, and puts its messages to a neighbour, in its form.
 
-    The Zenoh publisher is declared all the time, since it tells of demand. It is declared anew where its key or QoS
+    Zenoh's publisher is declared all the time, since it tells of demand. It is declared anew where its key or QoS
     changes: with another type, with a cache once the topic is known to be latched, and with a lower priority once its
     messages are large. What waits in the old one is still sent for a second. Messages that come by one read are
     numbered, stamped and queued together.
@@ -123,12 +90,14 @@ class ExportedTopic:
     Args:
         source: The topic.
         graph: The gateway's graph.
-        session: The Zenoh session.
-        dialect: Of the neighbour.
+        session: The session of the neighbour.
         rate: Messages a second that cross at most; ``None``: no limit.
         size: Bytes a second that cross at most; ``None``: no limit.
 
     Attributes:
+        payload: Makes the neighbour's form of a message; ``None``: it has none, and is left out.
+        attachment: Makes what goes with a message, of its number from 1, and of when it came, in nanoseconds since
+            1970.
         about: The publisher's last header; ``None`` before the first.
         wanted: Whether the neighbour subscribes.
         problem: Why its messages do not cross; empty for nothing.
@@ -136,21 +105,16 @@ class ExportedTopic:
         limited: Messages that a limit has kept back.
     """
 
-    # More than twelve fields: the demand, the publisher here, that of Zenoh, and the counts change each other.
+    # More than twelve fields: the demand, the publishers here and there, and the counts change each other.
 
     def __init__(
-        self,
-        source: MeshSource,
-        graph: AgentGraph,
-        session: Ros2Link,
-        dialect: ExportDialect,
-        rate: float | None = None,
-        size: int | None = None,
+        self, source: MeshSource, graph: AgentGraph, session: Ros2Link, rate: float | None, size: int | None
     ) -> None:
-        self.source = source
+        self.source: Final = source
+        self.payload: Callable[[memoryview], bytes | None] = bytes
+        self.attachment: Callable[[int, int], bytes] = lambda _sequence, _stamp: b""
         self._graph = graph
         self._session = session
-        self._dialect = dialect
         self._limits = TopicLimits.of(rate, size)
         self.about: TopicDescription | None = None
         self.wanted = False
@@ -163,14 +127,41 @@ class ExportedTopic:
         self._publisher: Publishing | None = None
         self._tap: TopicTap | None = None
         self._opening = self._closed = False
-        self._linger: asyncio.TimerHandle | None = None
-        self._asking: list[asyncio.Future[TopicDescription]] = []
+        self._linger = Delay()
+        # Questions for the header that wait, and whether it has come by the present connection.
+        self._asking = 0
+        self._header_came = asyncio.Event()
         # The messages of the present read.
         self._collected: list[bytes] = []
         # The last message of a latched topic.
         self._last: bytes | None = None
         # When that is sent, which a limit holds back.
-        self._held: asyncio.TimerHandle | None = None
+        self._held = Delay()
+
+    @abstractmethod
+    def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
+        """Announce it; return the key and the QoS to publish by; ``None``: the header has to be known first.
+
+        Args:
+            about: The publisher's header; ``None`` while it is not known.
+            latched: Whether a late subscriber is to get its last message.
+            large: Whether its messages are large.
+
+        Raises:
+            RmpaError: It cannot cross; the text says why.
+        """
+
+    @abstractmethod
+    def linger(self, *, keeps: bool) -> float | None:
+        """Seconds for which its publisher stays connected without demand; ``None``: for good.
+
+        Args:
+            keeps: Whether its last message is kept for late subscribers, of which one has come.
+        """
+
+    def say(self, problem: str) -> None:
+        """Why its messages do not cross has changed; empty for nothing."""
+        self.problem = problem
 
     @property
     def announced(self) -> bool:
@@ -203,20 +194,21 @@ class ExportedTopic:
             RmpaError: It does not answer in that time, or cannot cross.
         """
         if self._tap is None or self._tap.description is None:
-            if self._closed or len(self._asking) >= _HEADER_QUERIES_MAX:
+            if self._closed or self._asking >= _HEADER_QUERIES_MAX:
                 raise RmpaError("too many questions for this publisher's header wait already, or it has gone")
-            answer: asyncio.Future[TopicDescription] = asyncio.get_running_loop().create_future()
-            self._asking.append(answer)
+            self._asking += 1
             self._judge()
             try:
                 async with asyncio.timeout(within):
-                    await answer
+                    await self._header_came.wait()
             except TimeoutError:
                 why = self.problem or "no connection to it yet"
                 raise RmpaError(f"{self.source.node} of {self.source.module} does not answer: {why}") from None
             finally:
-                self._asking.remove(answer)
+                self._asking -= 1
                 self._judge()
+            if self._closed:
+                raise RmpaError(f"{self.source.name} of {self.source.module} is not offered any more")
         if self.about is None or self._failed:
             raise RmpaError(self.problem or "the publisher's header is not known")
         return self.about
@@ -224,27 +216,23 @@ class ExportedTopic:
     def close(self) -> None:
         """Take everything back; what waits for Zenoh is still sent for a moment."""
         self._closed = True
-        self._stop_lingering()
-        self._drop_held()
-        for answer in self._asking:
-            if not answer.done():
-                gone = f"{self.source.name} of {self.source.module} is not offered any more"
-                answer.set_exception(RmpaError(gone))
+        self._linger.cancel()
+        self._held.cancel()
+        self._header_came.set()
         self._flush()
         self._disconnect()
         if self._publisher is not None:
             self._publisher.close()
-        self._dialect.say("")
-        self._dialect.close()
+        self.say("")
 
     def _announce(self) -> None:
         """Declare the publisher that the facts ask for."""
         try:
-            terms = self._dialect.announce(self.about, latched=self._latched, large=self._large)
+            terms = self.announce(self.about, latched=self._latched, large=self._large)
             self._failed = False
         except RmpaError as error:
             terms, self._failed = None, True
-            self._tell(str(error))
+            self.say(str(error))
         if terms == self._terms:
             return
         self._flush()
@@ -272,24 +260,18 @@ class ExportedTopic:
         if self._closed:
             return
         if self.wanted or self._asking or (self._terms is None and not self._failed):
-            self._stop_lingering()
+            self._linger.cancel()
             if self._tap is None and not self._opening:
                 self._opening = True
                 self._tap = self._graph.tap(self.source, self._message, self._described, self._lost)
                 self._opening = False
                 self._judge()
-        elif self._tap is not None and self._linger is None:
-            delay = self._dialect.linger(keeps=self._latched and self._was_wanted)
+        elif self._tap is not None and not self._linger:
+            delay = self.linger(keeps=self._latched and self._was_wanted)
             if delay is not None:
-                self._linger = asyncio.get_running_loop().call_later(delay, self._end_demand)
-
-    def _stop_lingering(self) -> None:
-        if self._linger is not None:
-            self._linger.cancel()
-            self._linger = None
+                self._linger.set(delay, self._end_demand)
 
     def _end_demand(self) -> None:
-        self._linger = None
         self._disconnect()
         # What it keeps would be told to the next subscriber, although the publisher may have a newer message.
         self._last, self._latched, self._was_wanted = None, False, False
@@ -297,6 +279,7 @@ class ExportedTopic:
 
     def _disconnect(self) -> None:
         tap, self._tap = self._tap, None
+        self._header_came.clear()
         if tap is not None:
             tap.close()
 
@@ -304,24 +287,19 @@ class ExportedTopic:
         self._flush()
         self.about = about
         differs = f"its publisher has the type {about.type}, the graph says {self.source.type}"
-        self._tell(differs if about.type != self.source.type else "")
+        self.say(differs if about.type != self.source.type else "")
         self._latched = about.latching
         self._repeated = about.latching and self._last is not None
         self._announce()
-        for answer in self._asking:
-            if not answer.done():
-                answer.set_result(about)
+        self._header_came.set()
         self._judge()
 
     def _lost(self, reason: str) -> None:
         self.problem = reason
-
-    def _tell(self, problem: str) -> None:
-        self.problem = problem
-        self._dialect.say(problem)
+        self._header_came.clear()
 
     def _message(self, body: memoryview) -> None:
-        if self._failed or (payload := self._dialect.payload(body)) is None:
+        if self._failed or (payload := self.payload(body)) is None:
             return
         if self._latched:
             repeated, self._repeated = self._repeated and payload == self._last, False
@@ -338,24 +316,16 @@ class ExportedTopic:
             if not self._limits.admit(now, len(payload)):
                 self.limited += 1
                 if self._latched:  # the last one is sent as soon as the limits let it
-                    self._drop_held()
-                    loop = asyncio.get_running_loop()
                     delay = self._limits.next(now, len(payload)) - now
-                    self._held = loop.call_later(delay, self._send_last, payload)
+                    self._held.set(delay, partial(self._send_last, payload))
                 return
-            self._drop_held()
+            self._held.cancel()
         self._send(payload)
 
     def _send_last(self, payload: bytes) -> None:
-        self._held = None
         if self._limits is not None and self._limits.admit(time.monotonic() + _BOUNDARY, len(payload)):
             self.limited -= 1
             self._send(payload)
-
-    def _drop_held(self) -> None:
-        if self._held is not None:
-            self._held.cancel()
-            self._held = None
 
     def _send(self, payload: bytes) -> None:
         if len(payload) >= limits.LARGE_MESSAGE and not self._large:
@@ -372,7 +342,7 @@ class ExportedTopic:
         """Queue what has come by the present read."""
         payloads, self._collected = self._collected, []
         if payloads and self._publisher is not None:
-            first, stamp, attachment = self.messages + 1, time.time_ns(), self._dialect.attachment
+            first, stamp, attachment = self.messages + 1, time.time_ns(), self.attachment
             self.messages += len(payloads)
             self._publisher.put_all(
                 [(each, attachment(number, stamp)) for number, each in enumerate(payloads, first)]

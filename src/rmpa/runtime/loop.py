@@ -138,6 +138,32 @@ class MachineTimer:
         self.arm()
 
 
+class Delay:
+    """One call that is due later, unless it is cancelled or another one is set; true while it is due."""
+
+    def __init__(self) -> None:
+        self._handle: asyncio.TimerHandle | None = None
+
+    def __bool__(self) -> bool:
+        return self._handle is not None
+
+    def set(self, seconds: float, callback: Callable[[], object]) -> None:
+        """Call back after so many seconds, in place of what was set before."""
+
+        def call() -> None:
+            self._handle = None
+            callback()
+
+        self.cancel()
+        self._handle = asyncio.get_running_loop().call_later(seconds, call)
+
+    def cancel(self) -> None:
+        """Do not call back."""
+        if self._handle is not None:
+            self._handle.cancel()
+            self._handle = None
+
+
 # A timer as a file descriptor (timerfd_create(2)). Due at an absolute time, to the microsecond.
 #
 # The event loop's own timers are rounded to milliseconds, and a sleeping thread wakes up late by the timer slack of

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import CANCEL_TYPE, ActionPair
 from rmpa.gateway.ros2.goals import (
     ALL_GOALS,
     GoalId,
@@ -24,7 +23,7 @@ from rmpa.gateway.ros2.goals import (
     send_goal_response,
     with_uuid,
 )
-from rmpa.gateway.ros2.pairs import TypeMapping
+from rmpa.gateway.ros2.pairs import CANCEL_TYPE, ActionPair, TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import SystemClock
@@ -138,14 +137,8 @@ class Out(SystemClock):
 def goals_of(machine: type[GoalsToRos1 | GoalsToRos2]) -> tuple[Any, Out]:
     """The goals of one direction, as of any type: their requests are those of a test; and what they do."""
 
-    class Made(Out, machine):  # type: ignore[misc, valid-type]
-        def __init__(self) -> None:
-            Out.__init__(self)
-            machine.__init__(self, self)
-            self.pair = PAIR
-
-    made = Made()
-    return made, made
+    out: Any = Out()
+    return machine(out, PAIR, out), out
 
 
 def to_ros2() -> tuple[Any, Out]:

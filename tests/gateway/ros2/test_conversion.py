@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from rmpa.gateway.ros2.conversion import Conversion, ConversionError, NoConversion
-from rmpa.gateway.ros2.pairs import TypeMapping
-from rmpa.gateway.ros2.services import ServicePair
+from rmpa.gateway.ros2.pairs import ServicePair, TypeMapping
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.ros.types.definitions import Field, known_types
 from rmpa.ros.types.find import find_service_type

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from rmpa.core.errors import RmpaError
+from rmpa.gateway.ros2.asking import Ros2Asker, _kind, service_types
 from rmpa.gateway.ros2.conversion import Ros2Codec
 from rmpa.gateway.ros2.format import EntityKind
-from rmpa.gateway.ros2.parameters import Ros2Parameters, _kind
-from rmpa.gateway.ros2.types import service_types
 from rmpa.gateway.rules import CrossingRules
-from rmpa.gateway.zenoh.threads import ZenohReply
+from rmpa.gateway.zenoh.threads import ZenohSample
 
 
 class Node:
@@ -29,7 +27,7 @@ class Node:
     def at(self, name: str, kind: EntityKind) -> Any:
         return iter([name] if name.rpartition("/")[2] in self.services and kind is EntityKind.SERVICE else [])
 
-    async def call(self, server: str, request: bytes) -> ZenohReply:
+    async def call(self, server: str, request: bytes) -> ZenohSample:
         kind = "rcl_interfaces/srv/" + server.rpartition("/")[2].title().replace("_", "")
         asked = Ros2Codec(service_types(), f"{kind}_Request").read(request)
         self.asked.append(asked)
@@ -39,7 +37,7 @@ class Node:
         elif "Get" in kind:
             answer = {"values": [VALUES.get(name, {}) for name in asked["names"]]}
         made = Ros2Codec(service_types(), f"{kind}_Response").write(answer)
-        return ZenohReply("", made + b"garbage", b"", ok=True)
+        return ZenohSample(made + b"garbage")
 
 
 VALUES = {
@@ -50,12 +48,20 @@ VALUES = {
 ALL = ("list_parameters", "get_parameters", "set_parameters_atomically")
 
 
-def parameters(node: Node) -> Ros2Parameters:
-    return Ros2Parameters(cast("Any", SimpleNamespace(rules=CrossingRules(), ros2=node, asker=node)))
+class Asker(Ros2Asker):
+    """Asks the stand-in."""
+
+    def __init__(self, node: Node) -> None:
+        given: Any = node
+        super().__init__(given, given, given, CrossingRules())
+        self._node = node
+
+    async def call(self, server: Any, request: bytes) -> ZenohSample:
+        return await self._node.call(server, request)
 
 
 async def ask(node: Node, why: str = "", **args: str) -> Any:
-    text = await parameters(node).answer({"node": "/arm", **args}, lambda _: why)
+    text = await Asker(node).parameters({"node": "/arm", **args}, lambda _: why)
     return json.loads(text) if text else None
 
 

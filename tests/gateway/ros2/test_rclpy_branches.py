@@ -8,9 +8,7 @@ from typing import Any
 
 import pytest
 
-from rmpa.gateway.ros2.half.branches import handle_of, look_at_events
-from rmpa.gateway.ros2.half.taker import Taker
-from rmpa.gateway.ros2.half.waits import GraphGuard, Waits
+from rmpa.gateway.ros2.half.branches import GraphGuard, Taker, Waits, handle_of, look_at_events
 
 
 class Capsule(nullcontext[str]):

@@ -148,15 +148,15 @@ async def test_messages_calls_and_demand_and_all_of_it_again_after_a_death(sessi
     arrived: list[bytes] = []
     session.subscribe(publisher.key(), lambda sample: arrived.append(sample.payload))
     attachment = Ros2Attachment(1, 0, gid_of(publisher.token())).serialize()
-    sender.put(b"one", attachment)
+    sender.put_all([(b"one", attachment)])
     await until(lambda: arrived == [b"one"])
     assert (await session.get(publisher.key(), b"ask", attachment))[0].payload == b"ASK"
 
-    sender.put(b"die", attachment)
+    sender.put_all([(b"die", attachment)])
     await until(lambda: ("MS", False) in told)
     assert (await session.get(publisher.key(), b"ask", attachment))[0].ok is False
     await until(lambda: not session.problem)
-    sender.put(b"two", attachment)
+    sender.put_all([(b"two", attachment)])
     await until(lambda: arrived[-1] == b"two")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rmpa.gateway.ros2 import types as type_description
+from rmpa.gateway.ros2 import asking as type_description
 from rmpa.gateway.ros2.types import Ros2Field, Ros2Types
 
 IDS = {name: number for number, name in type_description._BASES.items() if number not in (13, 21)}

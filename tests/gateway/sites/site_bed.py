@@ -69,8 +69,8 @@ class Site:
     def imported(self, name: str) -> ImportedTopic:
         """A topic that comes in."""
         (entry,) = (each for each in self.neighbour.imports.entries if each.source.name == name)
-        topic = self.neighbour.topics.imported(entry)
-        assert topic is not None
+        topic = self.neighbour.imported[entry.source]
+        assert isinstance(topic, ImportedTopic)
         return topic
 
     async def subscribed(self, name: str, node: str = "/talker") -> MemoryTopic:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -10,10 +13,10 @@ from hypothesis import strategies as st
 
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
-from rmpa.gateway.sites.catalogue import CatalogueChange, Leader, SiteCatalogue
+from rmpa.gateway.sites.catalogue import Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource
 
-FOUND, RENEWED, GONE = CatalogueChange.FOUND, CatalogueChange.RENEWED, CatalogueChange.GONE
+FOUND, RENEWED, GONE = "found", "renewed", "gone"
 FIRST = SiteGateway("cloud", 1, "1" * 32)
 SECOND = SiteGateway("cloud", 2, "2" * 32)
 ARM = SiteModule("cloud", "arm", "a" * 32)
@@ -27,17 +30,27 @@ class Followed(SiteCatalogue):
     """A catalogue of the site ``home``, and what it has told."""
 
     def __init__(self, own: str = "home") -> None:
-        self.told: list[tuple[CatalogueChange, SiteModule | SiteSource]] = []
-        super().__init__(own, lambda change, item: self.told.append((change, item)))
+        self.told: list[tuple[str, SiteSource]] = []
+        tell = {word: partial(self._told, word) for word in (FOUND, RENEWED, GONE)}
+        super().__init__(own, cast("Any", SimpleNamespace(**tell)), lambda *_: None)
+
+    def _told(self, word: str, source: SiteSource) -> None:
+        self.told.append((word, source))
 
     def all_tokens(self, now: float, *, alive: bool) -> None:
         for item in EVERYTHING:
             self.token(item.token(), now, alive=alive)
 
 
-def told(catalogue: Followed) -> list[tuple[CatalogueChange, SiteModule | SiteSource]]:
+def told(catalogue: Followed) -> list[tuple[str, SiteSource]]:
     events, catalogue.told[:] = list(catalogue.told), []
     return events
+
+
+def every_source(catalogue: SiteCatalogue) -> list[SiteSource]:
+    """All that is there."""
+    modules = [module for site in catalogue.sites for module in catalogue.modules(site)]
+    return [source for module in modules for source in catalogue.sources(module)]
 
 
 def with_everything() -> Followed:
@@ -47,9 +60,9 @@ def with_everything() -> Followed:
     return catalogue
 
 
-@pytest.mark.parametrize(("gone", "also", "left"), [(ARM, [SCAN], [BASE]), (SCAN, [], [ARM, BASE])])
+@pytest.mark.parametrize(("gone", "left"), [(ARM, [BASE]), (SCAN, [ARM, BASE])])
 def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sources_and_a_source_alone(
-    gone: SiteModule | SiteSource, also: list[SiteSource], left: list[SiteModule]
+    gone: SiteModule | SiteSource, left: list[SiteModule]
 ) -> None:
     catalogue = with_everything()
     catalogue.token(gone.token(), 10.0, alive=False)
@@ -57,7 +70,7 @@ def test_a_module_that_is_killed_is_gone_within_a_fifth_of_a_second_with_its_sou
     assert due is not None
     assert due <= 10.2
     catalogue.handle_timer(due)
-    assert told(catalogue) == [(GONE, each) for each in (*also, gone)]
+    assert told(catalogue) == [(GONE, SCAN)]
     assert catalogue.modules("cloud") == left
 
 
@@ -104,15 +117,13 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
     shown: set[object] = set()
     now = 0.0
 
-    def follow(change: CatalogueChange, item: SiteModule | SiteSource) -> None:
-        if change is FOUND:
+    def follow(change: str, item: SiteSource) -> None:
+        if change == FOUND:
             assert item not in shown
-            assert isinstance(item, SiteModule) or item.module in shown
             shown.add(item)
-        elif change is RENEWED:
+        elif change == RENEWED:
             assert item in shown
         else:
-            assert not any(isinstance(each, SiteSource) and each.module == item for each in shown)
             shown.remove(item)
 
     for item, there, pause in changes:
@@ -127,12 +138,8 @@ def test_events_say_what_the_tokens_say_in_any_order(changes: list[tuple[SiteSou
     catalogue.handle_timer(now + 10)
     for event in told(catalogue):
         follow(*event)
-    wanted = {
-        item
-        for item in alive
-        if isinstance(item, SiteModule) or (isinstance(item, SiteSource) and item.module in alive)
-    }
-    assert shown == wanted == set(catalogue.all())
+    wanted = {item for item in alive if isinstance(item, SiteSource) and item.module in alive}
+    assert shown == wanted == set(every_source(catalogue))
     assert catalogue.next_timer() is None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from dataclasses import replace
 
@@ -16,7 +15,7 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.config.settings import TrustSettings
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
-from rmpa.gateway.sites.catalogue import SiteCatalogue, SiteHistory
+from rmpa.gateway.sites.catalogue import SiteCatalogue
 from rmpa.gateway.sites.keys import (
     AttachmentReader,
     MessageSource,
@@ -24,8 +23,9 @@ from rmpa.gateway.sites.keys import (
     SiteSource,
     parse_token,
 )
-from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
+from rmpa.gateway.sites.site import SiteExport, SiteExports, SiteImport, SiteImports
 from rmpa.trust.permissions import Permissions
+from tests.gateway.sites.test_catalogue import every_source
 
 T, S = SourceKind.TOPIC, SourceKind.SERVICE
 RUN = "0123456789abcdef" * 2
@@ -49,6 +49,9 @@ class Exports(SiteExports):
         told = CrossingRules(rules, gate=gate)
         super().__init__(site, told, lambda item, there: self.told.append((item, there)))
 
+    def refusals(self) -> list[tuple[MeshSource, str]]:
+        return [(source, why) for source, _, why in self.judged() if why]
+
 
 class Imports(SiteImports):
     """Imports, and the changes that they have told."""
@@ -56,6 +59,9 @@ class Imports(SiteImports):
     def __init__(self, *rules: CrossingRule) -> None:
         self.told: list[tuple[SiteImport | None, SiteImport | None]] = []
         super().__init__(CrossingRules(rules), lambda old, new: self.told.append((old, new)))
+
+    def refusals(self) -> list[tuple[SiteSource, str]]:
+        return [(source, why) for source, _, why in self.judged() if why]
 
 
 def test_what_stays_home_by_a_rule_or_a_name_that_no_key_can_hold_is_told() -> None:
@@ -85,7 +91,7 @@ def test_what_exceeds_the_bound_is_told_and_offered_when_there_is_room(monkeypat
     assert (source.name, "already" in why) == ("/two", True)
     exports.changed(mesh_source("/one"), there=False)
     assert [entry.source.name for entry in exports.entries] == ["/two"]
-    assert list(exports.refusals()) == []
+    assert exports.refusals() == []
 
 
 def test_what_permissions_let_no_site_have_is_offered_to_none_and_the_rest_to_those_that_may() -> None:
@@ -137,7 +143,7 @@ def test_of_two_types_under_one_name_the_first_is_shown_and_the_other_told() -> 
     assert (source, "std_msgs/String" in why, "std_msgs/Bool" in why) == (second, True, True)
     imports.gone(first)
     assert [entry.announced for entry in imports.entries] == [second]
-    assert list(imports.refusals()) == []
+    assert imports.refusals() == []
 
 
 def test_a_new_run_of_a_module_continues_its_sources() -> None:
@@ -212,19 +218,19 @@ def source(
 
 def test_all_sites_together_announce_a_bounded_number_of_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    catalogue = SiteCatalogue("home", lambda *_: None)
+    catalogue = SiteCatalogue("home", Imports(), lambda *_: None)
     for site in ("a", "b", "c"):
         catalogue.token(SiteModule(site, "arm", RUN).token(), 0.0, alive=True)
         for number in range(60):
             catalogue.token(source(number, "/x", "a/B", site=site).token(), 0.0, alive=True)
-    assert sum(isinstance(each, SiteSource) for each in catalogue.all()) == 100
+    assert len(every_source(catalogue)) == 100
     assert catalogue.counters["site.limit"] == 80
     assert [catalogue.refused(site) for site in "abc"] == [0, 20, 60]
     for number in range(60):  # what goes makes room
         catalogue.token(source(number, "/x", "a/B", site="a").token(), 1.0, alive=False)
     catalogue.handle_timer(10.0)
     catalogue.token(source(0, "/y", "a/B", site="c").token(), 10.0, alive=True)
-    assert sum(isinstance(each, SiteSource) for each in catalogue.all()) == 41
+    assert len(every_source(catalogue)) == 41
 
 
 def test_thousands_of_publishers_of_one_name_are_judged_in_linear_time() -> None:
@@ -242,13 +248,13 @@ def test_thousands_of_publishers_of_one_name_are_judged_in_linear_time() -> None
 @pytest.mark.parametrize("kind", list(SourceKind))
 def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: SourceKind) -> None:
     """One program that shows and hides a source must not keep the gateway busy with all others of its name."""
-    imports = SiteImports(CrossingRules(), lambda *_: None)
+    imports = Imports()
     holder = source(0, "/x", "a/First", kind)
     imports.found(holder)
     for number in range(1, MANY):
         imports.found(source(number, "/x", f"a/T{number}", kind))
     assert [entry.source.node for entry in imports.entries] == ["/node0"]
-    assert sum(1 for _ in imports.refusals()) == MANY - 1, "each one is told, with its reason"
+    assert len(imports.refusals()) == MANY - 1, "each one is told, with its reason"
     judged = 0
     plan = imports._plan
 
@@ -267,15 +273,17 @@ def test_a_crowd_that_waits_for_one_name_is_not_judged_anew_each_time(kind: Sour
 
 def test_what_sites_had_that_are_away_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SITES_SOURCES_MAX", 100)
-    now = itertools.count(0.0)
-    history = SiteHistory(lambda: next(now))
-    for site in (f"s{number}" for number in range(20)):
-        history.seen([site])
-        for number in range(30):
-            history.source(source(number, "/x", "a/B", site=site), there=True)
-    history.seen([])
-    assert len(history.away) == 20
-    assert [site for site, _ in history.had("/x")] == ["s17", "s18", "s19"]
+    catalogue = SiteCatalogue("home", Imports(), lambda *_: None)
+    for when, site in enumerate(f"s{number}" for number in range(20)):
+        tokens = [SiteModule(site, "arm", RUN).token()]
+        tokens += [source(number, "/x", "a/B", site=site).token() for number in range(30)]
+        for alive in (True, False):
+            for token in tokens:
+                catalogue.token(token, 10.0 * when, alive=alive)
+        catalogue.handle_timer(10.0 * when + 1)
+    assert len(catalogue.away) == 20
+    assert [site for site, _ in catalogue.had("/x")] == ["s17", "s18", "s19"]
+    assert catalogue.since_ago("s19", 200.0) == 9.0
 
 
 def test_attachments_of_invented_sources_fill_no_memory() -> None:

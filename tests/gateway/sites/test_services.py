@@ -13,8 +13,8 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.plans import SiteExport, SiteImport
-from rmpa.gateway.sites.services import SiteActions, SiteServices, asked_type, read_description
+from rmpa.gateway.sites.services import ImportedService, SiteActions, SiteServices, asked_type, read_description
+from rmpa.gateway.sites.site import SiteExport, SiteImport
 from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 from tests.gateway.memory_graph import MemoryGraph, MemoryService
 from tests.gateway.memory_zenoh import MemoryZenoh
@@ -63,9 +63,8 @@ class Sites:
     def __init__(self, timeout: float = 30.0, rules: CrossingRules | None = None) -> None:
         self.session, self.there, self.here = MemoryZenoh().session(), ServiceGraph(), MemoryGraph()
         self.exporter = SiteServices(site_context("warehouse", self.there, self.session, rules, timeout=timeout))
-        self.importer = SiteServices(site_context("office", self.here, self.session, timeout=timeout))
         self.exporter.export(EXPORT)
-        self.importer.show(IMPORT)
+        self.imported = ImportedService(IMPORT, site_context("office", self.here, self.session, timeout=timeout))
 
     @property
     def service(self) -> MemoryService:
@@ -83,21 +82,20 @@ class Sites:
 async def sites() -> AsyncIterator[Sites]:
     found = Sites()
     yield found
-    for part in (found.importer, found.exporter):
-        await part.close()
+    await found.exporter.close()
 
 
 async def test_a_call_brings_the_response_and_a_query_the_type(sites: Sites) -> None:
     assert await sites.service.describe() == MOVE
     assert await sites.service.serve(b"abc") == b"abc"
-    service = sites.importer.imported[FOREIGN]
+    service = sites.imported
     assert (service.calls, service.failed, service.problem) == (1, 0, "")
 
 
 async def test_a_program_calls_by_the_exact_type_and_without_attachment(sites: Sites) -> None:
     key = "rmpa/1/warehouse/arm/s/std_srvs%Trigger/move"
     (reply,) = await sites.session.get(key, b"x")
-    assert (reply.ok, reply.key, reply.payload) == (True, key, b"x")
+    assert (reply.ok, reply.payload) == (True, b"x")
     await sites.service.describe()
     (wrong,) = await sites.session.get("rmpa/1/warehouse/arm/s/std_srvs%Empty/move", b"x")
     assert (wrong.ok, wrong.text) == (False, "service /move is of the type std_srvs/Trigger, not std_srvs/Empty")
@@ -123,7 +121,7 @@ async def test_a_server_that_hangs_ends_with_the_time_out() -> None:
 
 async def test_a_service_that_leaves_during_a_call_ends_it_at_once(sites: Sites) -> None:
     call = await sites.under_way()
-    sites.importer.hide(IMPORT)
+    sites.imported.close()
     with pytest.raises(PeerRefused, match="service /move of arm at site warehouse has left"):
         await call
     assert sites.here.services == {}
@@ -132,7 +130,7 @@ async def test_a_service_that_leaves_during_a_call_ends_it_at_once(sites: Sites)
 async def test_a_new_run_of_the_module_ends_the_calls_of_the_old_one_and_is_called_then(sites: Sites) -> None:
     call, service = await sites.under_way(), sites.service
     newer = SiteSource(SiteModule("warehouse", "arm", "1" * 32), SourceKind.SERVICE, "*", "/driver", "/move")
-    sites.importer.renew(SiteImport(FOREIGN, newer))
+    sites.imported.renew(SiteImport(FOREIGN, newer))
     with pytest.raises(PeerRefused, match="has left"):
         await call
     sites.there.go.set()

@@ -19,7 +19,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.plans import SiteImport
+from rmpa.gateway.sites.site import SiteImport
 from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis
@@ -152,7 +152,7 @@ async def test_a_site_that_left_is_unreachable_since_then_and_one_that_never_was
     (module,) = report.sites[1].modules
     assert (module.name, module.topics, module.services, module.shown) == ("arm", 1, 0, 1)
     await yard.site.neighbour.close()
-    await until(lambda: hall.site.neighbour.history.away == ("yard",))
+    await until(lambda: hall.site.neighbour.catalogue.away == ("yard",))
     report = await hall.report()
     assert report.sites[1].state == "unreachable"
     assert report.sites[1].since_ago is not None

@@ -16,16 +16,17 @@ from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.rules import GatewaySettings
 from rmpa.config.settings import Settings
 from rmpa.core.errors import StartError
-from rmpa.gateway.zenoh import config as trust
-from rmpa.gateway.zenoh.config import MeshCertificates, SocketTuning, gateway_config, zenohd_config
-from rmpa.gateway.zenoh.queries import ArrivedQuery
+from rmpa.gateway.zenoh.config import bound_unsent, gateway_config, session_config, zenohd_config
+from rmpa.gateway.zenoh.session import ArrivedQuery
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.trust.certificates import DenyList
+from rmpa.trust.store import CA
 from tests.gateway.memory_zenoh import eventually
+from tests.gateway.zenoh_bed import put
 from tests.gateway.zenoh_fleet import Fleet
 from tests.trust.io.member_files import SecuredMesh
 
-FILES = MeshCertificates("ca.crt", "module.crt", "module.key")
+FILES = Path("trust")
 
 
 @pytest.mark.parametrize(
@@ -41,7 +42,7 @@ def test_what_only_connects_is_a_client_so_that_it_works_behind_nat(settings: Ga
     assert config.mode is mode
     tls = config.entries()["transport/link/tls"]
     assert isinstance(tls, dict)
-    assert (tls["enable_mtls"], tls["root_ca_certificate"]) == (True, "ca.crt")
+    assert (tls["enable_mtls"], tls["root_ca_certificate"]) == (True, str(FILES / CA))
 
 
 @pytest.mark.parametrize(
@@ -54,7 +55,7 @@ def test_what_only_connects_is_a_client_so_that_it_works_behind_nat(settings: Ga
     ],
 )
 def test_an_endpoint_that_is_not_secure_is_refused_and_named(
-    endpoint: str, certificates: MeshCertificates | None, why: str, remedy: str
+    endpoint: str, certificates: Path | None, why: str, remedy: str
 ) -> None:
     for settings in (GatewaySettings(connect=(endpoint,)), GatewaySettings(listen=(endpoint,))):
         with pytest.raises(StartError) as refused:
@@ -107,17 +108,15 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket, str]]:
 def test_the_connection_to_an_endpoint_is_bounded(ends: tuple[socket.socket, socket.socket, str]) -> None:
     ours, theirs, endpoint = ends
     before = unsent(theirs)
-    tuning = SocketTuning(UNSENT)
-    assert tuning.look([endpoint]) == 1
+    assert bound_unsent([endpoint], UNSENT) == 1
     assert (unsent(ours), unsent(theirs)) == (UNSENT, before)
-    assert tuning.look([endpoint]) == 0, "each once"
 
 
 @pytest.mark.parametrize("odd", ["udp/127.0.0.1:{}", "tcp/127.0.0.1", "", "tcp/[::1]:{}", "tcp/127.0.0.2:{}"])
 def test_other_endpoints_leave_it_alone(ends: tuple[socket.socket, socket.socket, str], odd: str) -> None:
     ours, _, endpoint = ends
     before = unsent(ours)
-    assert SocketTuning(UNSENT).look([odd.format(endpoint.rpartition(":")[2])]) == 0
+    assert bound_unsent([odd.format(endpoint.rpartition(":")[2])], UNSENT) == 0
     assert unsent(ours) == before
 
 
@@ -165,9 +164,9 @@ async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_sa
     scan = a.publisher(key, ZenohQos(cache=1), heard["matching"].append)
     valve = a.publisher("plant/valve", ZenohQos(), lambda _: None)
     await eventually(lambda: True in heard["matching"])
-    valve.put(b"open")
+    put(valve, b"open")
     await eventually(lambda: valve.sent)
-    scan.put(b"scan")
+    put(scan, b"scan")
     await eventually(lambda: heard["scan"])
     b.subscribe(key, lambda sample: heard["late"].append(sample.payload), history=True)
     await eventually(lambda: heard["late"])
@@ -175,8 +174,7 @@ async def test_a_member_may_use_the_keys_of_sites_whatever_the_rules_of_names_sa
     assert bool(heard["valve"]) == fleet_router, "with deny, other programs' keys do not pass"
 
     def stop(query: ArrivedQuery) -> None:
-        query.reply(query.key, b"stopped")
-        query.finish()
+        query.reply(b"stopped")
 
     a.queryable("rmpa/1/home/arm/s/*/stop", stop)
     async with asyncio.timeout(20):
@@ -208,7 +206,8 @@ def test_a_revoked_name_stays_out_of_the_table_while_its_certificates_may_be_val
 
     def subjects() -> object:
         mesh.save("hall", time.time())
-        return trust.access_table(settings)["subjects"]
+        table = session_config(settings).access_control
+        return None if table is None else table["subjects"]
 
     assert subjects() == [{"id": "members"}]
     mesh.deny = DenyList(members=("arm", "hall", "old")).with_name("old", time.time() - 8 * 86_400)
@@ -236,7 +235,7 @@ async def test_a_listener_that_is_no_authority_refuses_what_was_revoked_and_lets
     scan = a.publisher("rmpa/1/home/arm/t/a%B/scan", ZenohQos(cache=1), matching.append)
     a.token("rmpa/1/home/arm/up/00")
     await eventually(lambda: True in matching)
-    scan.put(b"scan")
+    put(scan, b"scan")
     await eventually(lambda: {b"scan", "rmpa/1/home/arm/up/00"} <= {*heard["later"]})
     assert heard["b"] == []
     # What it sends goes nowhere either.
@@ -244,11 +243,11 @@ async def test_a_listener_that_is_no_authority_refuses_what_was_revoked_and_lets
     a.subscribe("rmpa/1/home/arm/t/a%B/forged", lambda sample: forged.append(sample.payload))
     sent = b.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
     proof = later.publisher("rmpa/1/home/arm/t/a%B/forged", ZenohQos(), lambda _: None)
-    sent.put(b"forged")
+    put(sent, b"forged")
     await eventually(lambda: sent.sent)
 
     def arrived() -> bool:
-        proof.put(b"proof")
+        put(proof, b"proof")
         return b"proof" in forged
 
     await eventually(arrived)

@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.queries import ArrivedQuery
-from rmpa.gateway.zenoh.session import OpenSession
+from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession
 from rmpa.gateway.zenoh.threads import ArrivalQueue, Arrivals, QueuedPublisher, SendingLane, ZenohQos
 from tests.gateway.memory_zenoh import eventually
-from tests.gateway.zenoh_bed import ZenohBed
+from tests.gateway.zenoh_bed import ZenohBed, put
 
 
 class Handle:
@@ -49,7 +48,9 @@ def publisher(lane: SendingLane, handle: Handle, qos: ZenohQos, ended: list[str]
 async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counted(lane: SendingLane) -> None:
     handle = Handle()
     made = publisher(lane, handle, ZenohQos(messages=100))
-    dropped = sum(made.put(b"%d" % number) for number in range(1000))
+    for number in range(1000):
+        put(made, b"%d" % number)
+    dropped = made.dropped
     assert made.waiting <= 100
     handle.free.set()
     await eventually(lambda: not made.waiting)
@@ -60,9 +61,11 @@ async def test_behind_a_full_transport_the_oldest_are_dropped_and_all_are_counte
 async def test_a_message_larger_than_the_bound_still_goes_alone(lane: SendingLane) -> None:
     handle = Handle()
     made = publisher(lane, handle, ZenohQos(bytes=10))
-    assert made.put(bytes(100)) == 0
+    put(made, bytes(100))
     await eventually(lambda: not made._items)  # its turn has begun
-    assert [made.put(bytes(size)) for size in (100, 200)] == [0, 1]
+    for size in (100, 200):
+        put(made, bytes(size))
+    assert made.dropped == 1
     handle.free.set()
     await eventually(lambda: not made.waiting)
     assert [len(each) for each in handle.got] == [100, 200]
@@ -72,8 +75,8 @@ async def test_a_flood_does_not_starve_another_publisher_of_its_priority(lane: S
     handle = Handle()
     flood, other = publisher(lane, handle, ZenohQos(messages=5000)), publisher(lane, handle, ZenohQos())
     for _ in range(5000):
-        flood.put(bytes(1000))
-    other.put(b"other")
+        put(flood, bytes(1000))
+    put(other, b"other")
     handle.free.set()
     await eventually(lambda: not flood.waiting and not other.waiting)
     assert handle.got.index(b"other") <= 130
@@ -85,7 +88,7 @@ async def test_a_publisher_that_cannot_send_is_undeclared_after_a_second_and_cou
     handle, ended = Handle(), list[str]()
     made = publisher(lane, handle, ZenohQos(), ended)
     for _ in range(200):
-        made.put(b"x")
+        put(made, b"x")
     made.close()
     await eventually(lambda: ended)
     assert made.dropped >= 200 - 64
@@ -101,7 +104,7 @@ async def test_what_zenoh_refuses_counts_as_dropped(lane: SendingLane) -> None:
             raise TimeoutError
 
     made = publisher(lane, Closed(), ZenohQos())
-    made.put(b"x")
+    put(made, b"x")
     await eventually(lambda: made.dropped == 1)
     assert made.sent == 0
 
@@ -254,18 +257,20 @@ async def test_a_client_that_asks_and_does_not_read_fills_no_memory(
     victim: OpenSession, eve: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Answers wait in order for Zenoh; what is beyond the bound ends its query."""
-    monkeypatch.setattr(limits, "ANSWERS_WAITING_MAX", 3)
-    taken: list[int] = []
+    monkeypatch.setattr(limits, "ANSWERS_WAITING_MAX", 1)
+    taken: list[ArrivedQuery] = []
+    held: list[Any] = []
 
     def answer(query: ArrivedQuery) -> None:
-        for number in range(200):
-            query.reply("q/q", bytes(200_000))
-            taken.append(number)
-        query.finish()
+        query.reply(bytes(200_000))
+        taken.append(query)
+
+    def ask() -> None:
+        held.extend(eve.get("q/q", timeout=5.0) for _ in range(200))
 
     victim.queryable("q/q", answer)
-    await repeated(lambda: asyncio.to_thread(lambda: list(eve.get("q/q", timeout=2.0))), lambda _: taken)
+    await repeated(lambda: asyncio.to_thread(ask), lambda _: len(taken) > 100)
     assert await counted(victim, "zenoh.answer.limit")
     publisher = victim.publisher(KEY, ZenohQos(), lambda _: None)
-    publisher.put(b"it lives")
+    put(publisher, b"it lives")
     await eventually(lambda: publisher.sent)

@@ -3,46 +3,40 @@
 from __future__ import annotations
 
 import asyncio
-from abc import abstractmethod
+import time
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, proxy_name
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import PART, ActionPair, action_name
-from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, data_key
-from rmpa.gateway.ros2.goals import Goals, GoalsToRos1, GoalsToRos2
+from rmpa.gateway.ros2.format import USUAL_QOS, EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos
+from rmpa.gateway.ros2.goals import GoalsToRos1, GoalsToRos2
 from rmpa.gateway.ros2.graph import SITE, valid_name
-from rmpa.gateway.ros2.pairs import derive_ros1
-from rmpa.gateway.ros2.services import SERVICE_NEEDS
+from rmpa.gateway.ros2.pairs import PART, ActionPair, find_types
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.definitions import Specification, known_specifications
-from rmpa.ros.types.find import find_message_type
 from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.loop import MachineTimer, SystemClock
+from rmpa.runtime.loop import Delay, MachineTimer, SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rosbags.typesys.store import Typestore
-
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.own_graph import TopicTap
     from rmpa.gateway.ros2.format import Ros2Endpoint
-    from rmpa.gateway.ros2.graph import OwnEndpoint
-    from rmpa.gateway.ros2.link import Declared, Publishing, Query
+    from rmpa.gateway.ros2.graph import OwnEndpoint, Publishing, Query
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import MeshSource
+    from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once.
 _ROS2_GOAL_TIMEOUT: Final = 86_400.0
 # Seconds for which an action's topics stay in ROS 1's graph once its server is gone: its last results leave.
 _ROS2_LAST_RESULTS: Final = 1.0
-# What the definition of an action is made of.
-KINDS: Final = ("Goal", "Result", "Feedback")
 # Seconds for an action server of ROS 1 to connect to the gateway's topics; then a goal is refused.
 _ROS2_ACTION_READY: Final = 5.0
 
@@ -62,42 +56,38 @@ _TYPES: Final = {
 }
 
 
-class JoinedAction(Goals):
+class JoinedAction(ABC):
     """An action of one side, as that of a server at the other one.
 
     Args:
         context: What the parts share.
         name: The action's name in ROS 2.
         here: Its name in the gateway's graph.
-        server: The server's node in the gateway's graph or ROS 2's.
         shown: The node that publishes its topics for ROS 1, below ``/rmpa/ros2``.
     """
 
-    # More than twelve fields: the action's names, what was declared at either side, and its goals with their timer.
-
-    def __init__(self, context: Ros2Context, name: str, here: str, server: str, shown: str) -> None:
-        super().__init__(SystemClock())
+    def __init__(self, context: Ros2Context, name: str, here: str, shown: str) -> None:
         self.here = here
         self._context = context
         self._name = name
-        self._server = server
         self._shown = shown
-        # Whether its types were found, and its server is there.
-        self._open = False
-        self._closed = False
-        self._timer = MachineTimer(self.next_timer, self.handle_timer)
+        # Its goals with their timer, once its types are found, and until its server is gone.
+        self._goals: GoalsToRos1 | GoalsToRos2 | None = None
+        self._timer: MachineTimer | None = None
         self._topics: dict[str, ProxiedTopic] = {}
         self._taps: dict[MeshSource, TopicTap] = {}
-        self._declared: list[Declared | OwnEndpoint | Publishing] = []
-        self._sequence = 0
-        context.start(self._join(), f"join action {name}")
+        self._declared: list[OwnEndpoint | Publishing] = []
+        self._joining = context.start(self._join(), f"join action {name}")
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back but the topics for ROS 1."""
-        self._closed, self._open = True, False
+        self._joining.cancel()
         self._context.say(self.here, "")
-        self.server_gone()
-        self._timer.close()
+        goals, self._goals = self._goals, None
+        if goals is not None:
+            goals.server_gone()
+        if self._timer is not None:
+            self._timer.close()
         for each in (*self._declared, *self._taps.values()):
             each.close()
 
@@ -116,45 +106,49 @@ class JoinedAction(Goals):
     async def _join(self) -> None:
         """Find the types, and join the action if they are a pair."""
 
+    def _begin(self, goals: GoalsToRos1 | GoalsToRos2) -> None:
+        self._goals = goals
+        self._timer = MachineTimer(goals.next_timer, goals.handle_timer)
+
     def _show(self, part: str, header: TopicDescription, on_demand: Callable[[bool], None]) -> None:
         source = ForeignSource(SourceKind.TOPIC, SITE, "", self._shown, f"{self.here}/{part}", header.type)
         self._topics[part] = self._context.graph.show_topic(source, on_demand)
         self._topics[part].describe(header)
 
-    def _declare(self, node: str, kind: EntityKind, part: str, qos: Ros2Qos | None = None) -> OwnEndpoint:
-        name, types = f"{self._name}{PART}{part}", self.pair.types[part]
-        made = self._context.nodes.declare(node, kind, name, *types, qos or Ros2Qos())
+    def _declare(
+        self,
+        node: str,
+        kind: EntityKind,
+        part: str,
+        types: tuple[str, str],
+        qos: Ros2Qos = USUAL_QOS,
+        take: Callable[[Any], object] | None = None,
+    ) -> OwnEndpoint:
+        made = self._context.nodes.declare(node, kind, f"{self._name}{PART}{part}", types, qos, take=take)
         self._declared.append(made)
         return made
 
     def _tap(self, source: MeshSource, part: str, changed: Callable[[object], None]) -> None:
         """Listen to a topic of ROS 1, as the node that publishes the others."""
         listener = proxy_name(f"{OWN_NODE}/{SITE}", self._shown)
-        self._taps[source] = self._context.graph.tap(
-            source, partial(self._take, part), changed, changed, listener=listener
-        )
+        take = partial(self._take, part)
+        self._taps[source] = self._context.graph.tap(source, take, changed, changed, listener=listener)
 
     def _take(self, part: str, message: Any) -> None:
-        """Take a message of a topic, by the method with its name."""
-        if self._open:
+        """Give a message of a topic to the goals, by the method with its name."""
+        if self._goals is not None:
             try:
-                getattr(self, part)(message)
+                getattr(self._goals, part)(message)
             except RmpaError as error:
                 self._context.say(f"{self.here} (messages)", str(error))
+            self._arm()
+
+    def _arm(self) -> None:
+        if self._goals is not None and self._timer is not None:
             self._timer.arm()
 
 
-async def find_types(*names: str) -> list[MessageType]:
-    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
-    return [await asyncio.to_thread(find_message_type, name) for name in names]
-
-
-async def _parts_of(ros1: str) -> list[MessageType]:
-    """Goal, result and feedback of an action of ROS 1; errors as for ``find_types``."""
-    return await find_types(*(f"{ros1}{kind}" for kind in KINDS))
-
-
-class OfferedAction(JoinedAction, GoalsToRos1):
+class OfferedAction(JoinedAction):
     """Offers one actionlib server to ROS 2.
 
     Args:
@@ -165,12 +159,13 @@ class OfferedAction(JoinedAction, GoalsToRos1):
     """
 
     def __init__(self, context: Ros2Context, name: str, ros1: str, server: Mapping[str, MeshSource]) -> None:
+        super().__init__(context, name, name, _NODE)
         self.ros1 = ros1
         self.server = dict(server)
         self._connected: set[str] = set()
         self._ready = asyncio.Event()
         self._publishers: dict[str, tuple[Publishing, bytes]] = {}
-        super().__init__(context, name, name, server["result"].proxy, _NODE)
+        self._sequence = 0
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, and all is taken back."""
@@ -181,18 +176,16 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         """Publish a message for ROS 2."""
         publisher, gid = self._publishers[topic]
         self._sequence += 1
-        publisher.put(message, Ros2Attachment(self._sequence, self._clock.wall_ns(), gid).serialize())
+        publisher.put_all([(message, Ros2Attachment(self._sequence, time.time_ns(), gid).serialize())])
 
     def answer(self, query: Query, response: bytes) -> None:
-        """Answer a request; its attachment is repeated, as rmw_zenoh does."""
+        """Answer a request of a client; its attachment is repeated, as rmw_zenoh does."""
         try:
             asked = Ros2Attachment.parse(query.attachment)
         except RmpaError as error:
             query.reply_error(str(error))
             return
-        attachment = Ros2Attachment(asked.sequence, self._clock.wall_ns(), asked.gid)
-        query.reply(query.key, response, attachment.serialize())
-        query.finish()
+        query.reply(response, Ros2Attachment(asked.sequence, time.time_ns(), asked.gid).serialize())
 
     async def _join(self) -> None:
         context = self._context
@@ -200,28 +193,24 @@ class OfferedAction(JoinedAction, GoalsToRos1):
             context.say(self.here, "ROS 2 does not allow the name of this action")
             return
         try:
-            rule = context.mapping.counterpart(self.ros1, "action")
-            pair = ActionPair(await _parts_of(self.ros1), rule, context.types)
+            rule = context.pairs.mapping.counterpart(self.ros1, "action")
+            pair = ActionPair(await ActionPair.find(self.ros1), rule, context.types)
             topics = await find_types(f"{self.ros1}ActionGoal", "actionlib_msgs/GoalID")
         except RmpaError as error:
             context.say(self.here, f"ROS 2 does not see this action: {error}")
             return
-        if self._closed:
-            return
-        self.pair, self._open = pair, True
+        self._begin(GoalsToRos1(self, pair, SystemClock()))
         for part, kind in zip(_OF_CLIENTS, topics, strict=True):
             self._show(part, kind.describe(), partial(self._demand, part))
-        for part in ("send_goal", "get_result", "cancel_goal"):
-            key = data_key(context.settings.ros2.domain, f"{self._name}{PART}{part}", *pair.types[part])
-            # Before its token, which clients wait for.
-            take = self._send_goal if part == "send_goal" else partial(self._request, part)
-            self._declared.append(context.session.queryable(key, take, SERVICE_NEEDS))
-            self._declare(self._server, EntityKind.SERVICE, part)
-        for part, qos, cache in (("feedback", Ros2Qos(), 0), ("status", _LATCHED, 1)):
-            endpoint = self._declare(self._server, EntityKind.PUBLISHER, part, qos)
-            publisher = context.session.publisher(endpoint.endpoint.key(), ZenohQos(cache=cache), lambda _: None)
+        node = self.server["result"].proxy
+        for part, qos, cache in (("feedback", USUAL_QOS, 0), ("status", _LATCHED, 1)):
+            made = self._declare(node, EntityKind.PUBLISHER, part, pair.types[part], qos)
+            publisher = context.session.publisher(made.endpoint.key(), ZenohQos(cache=cache), _ignore)
             self._declared.append(publisher)
-            self._publishers[part] = publisher, endpoint.gid
+            self._publishers[part] = publisher, made.gid
+        for part in ("send_goal", "get_result", "cancel_goal"):
+            take = self._send_goal if part == "send_goal" else partial(self._request, part)
+            self._declare(node, EntityKind.SERVICE, part, pair.types[part], take=take)
 
     def _demand(self, part: str, wanted: bool) -> None:
         (self._connected.add if wanted else self._connected.discard)(part)
@@ -254,17 +243,17 @@ class OfferedAction(JoinedAction, GoalsToRos1):
         self._request("send_goal", query)
 
     def _request(self, service: str, query: Query) -> None:
-        if not self._open:
+        if self._goals is None:
             query.reply_error("the action server of ROS 1 is gone")
             return
         try:
-            getattr(self, service)(query)
+            getattr(self._goals, service)(query)
         except RmpaError as error:
             query.reply_error(str(error))
-        self._timer.arm()
+        self._arm()
 
 
-class ShownAction(JoinedAction, GoalsToRos2):
+class ShownAction(JoinedAction):
     """Shows one action server of ROS 2 to actionlib's clients.
 
     Args:
@@ -275,54 +264,45 @@ class ShownAction(JoinedAction, GoalsToRos2):
     """
 
     def __init__(self, context: Ros2Context, server: Ros2Endpoint, name: str, here: str) -> None:
+        super().__init__(context, name, here, server.node.name)
         self.server = server
         self._clients: set[MeshSource] = set()
+        # What the gateway declares for its clients, by part.
         self._callers: dict[str, OwnEndpoint] = {}
-        self._leaving: asyncio.TimerHandle | None = None
-        super().__init__(context, name, here, server.node.name, server.node.name)
+        self._types: dict[str, tuple[str, str]] = {}
+        self._leaving = Delay()
 
     def follow(self, clients: set[MeshSource]) -> None:
         """The topics *goal* and *cancel* of its clients are these now."""
         self._clients = clients
-        if not self._open:
+        if self._goals is None:
             return
         for source in self._taps.keys() - clients:
             self._taps.pop(source).close()
         for source in clients - self._taps.keys():
             self._tap(source, source.here.rpartition("/")[2], _ignore)
-        if clients and "feedback" not in self._callers:  # from the first client on
-            for part in ("feedback", "status"):
-                self._callers[part] = self._declare(self._context.nodes.own_name, EntityKind.SUBSCRIPTION, part)
-                key, take = self._callers[part].endpoint.key(), partial(self._take, part)
-                self._declared.append(
-                    self._context.session.subscribe(key, lambda sample, take=take: take(sample.payload))  # type: ignore[misc]
-                )
+        for part in ("feedback", "status") if clients else ():  # from the first client on
+            self._caller(EntityKind.SUBSCRIPTION, part, partial(self._sample, part))
 
     def close(self) -> None:
         """The server is gone: goals under way end as aborted, then the topics go."""
         super().close()
         # The last results have to leave before their publishers.
-        self._leaving = asyncio.get_running_loop().call_later(_ROS2_LAST_RESULTS, self.finish)
+        self._leaving.set(_ROS2_LAST_RESULTS, self.finish)
 
     def finish(self) -> None:
         """Take its topics out of the graph, once it is closed."""
-        if self._leaving is not None:
-            self._leaving.cancel()
+        self._leaving.cancel()
         super().finish()
 
     def ask(self, service: str, uuid: bytes, request: bytes) -> None:
         """Call a service of the server, and tell the goals what comes of it."""
-        if self._open:
+        if self._goals is not None:
             self._context.start(self._ask(service, uuid, request), f"ask {service}")
 
     async def _join(self) -> None:
         context, server = self._context, self.server
         ros2 = server.type.removesuffix("_SendGoal")
-
-        def derive(store: Typestore, ros1: str) -> list[MessageType]:
-            own = {f"{ros2}_{kind}": f"{ros1}{kind}" for kind in KINDS}
-            return [derive_ros1(store, each, lambda it: own.get(it) or context.ros1_name(it)) for each in own]
-
         asked = (
             ("send_goal", EntityKind.SERVICE),
             ("get_result", EntityKind.SERVICE),
@@ -330,22 +310,21 @@ class ShownAction(JoinedAction, GoalsToRos2):
         )
         endpoints = [(f"{self._name}{PART}{part}", kind) for part, kind in asked]
         try:
-            pair = await context.find_pair(server, ros2, _parts_of, ActionPair, derive, *endpoints)
+            pair = await context.find_pair(server, ros2, ActionPair, *endpoints)
             headers = [kind.describe() for kind in await find_types("actionlib_msgs/GoalStatusArray")]
             headers += await self._outcome_headers(pair)
         except RmpaError as error:
-            context.say(self.here, f"the action of ROS 2's node {self._server} is not shown: {error}")
+            context.say(self.here, f"the action of ROS 2's node {server.node.name} is not shown: {error}")
             return
-        if self._closed:
-            return
-        self.pair, self._open = pair, True
+        self._types = pair.types
+        goals = GoalsToRos2(self, pair, SystemClock())
+        self._begin(goals)
 
         def wanted(there: bool) -> None:
-            if self._open:
-                self.show_status(wanted=there)
-                self._timer.arm()
+            goals.show_status(wanted=there)
+            self._arm()
 
-        for part, header in zip(("status", "feedback", "result"), headers, strict=True):
+        for part, header in zip(_OF_SERVER, headers, strict=True):
             self._show(part, header, wanted if part == "status" else _ignore)
         self.follow(self._clients)
 
@@ -353,26 +332,35 @@ class ShownAction(JoinedAction, GoalsToRos2):
     async def _outcome_headers(pair: ActionPair) -> list[TopicDescription]:
         """The headers of an action's feedback and result; made where this machine has no definition."""
         try:
-            return [
-                kind.describe() for kind in await find_types(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
-            ]
+            kinds = await find_types(f"{pair.ros1}ActionFeedback", f"{pair.ros1}ActionResult")
         except RmpaError:
             return [_wrapped(pair.ros1, "Feedback", pair.feedback.ros1), _wrapped(pair.ros1, "Result", pair.result)]
+        return [kind.describe() for kind in kinds]
+
+    def _caller(self, kind: EntityKind, part: str, take: Callable[[ZenohSample], None] | None = None) -> OwnEndpoint:
+        """What the gateway declares for all clients, once."""
+        if part not in self._callers:
+            node = self._context.nodes.own_name
+            self._callers[part] = self._declare(node, kind, part, self._types[part], take=take)
+        return self._callers[part]
+
+    def _sample(self, part: str, sample: ZenohSample) -> None:
+        self._take(part, sample.payload)
 
     async def _ask(self, service: str, uuid: bytes, request: bytes) -> None:
-        if service not in self._callers:
-            self._callers[service] = self._declare(self._context.nodes.own_name, EntityKind.CLIENT, service)
-        caller = self._callers[service]
+        within = _ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT
+        answer = await self._caller(EntityKind.CLIENT, service).call(request, within)
+        goals = self._goals
+        if not isinstance(goals, GoalsToRos2):
+            return  # its server has gone meanwhile
         try:
-            within = _ROS2_GOAL_TIMEOUT if service == "get_result" else limits.ROS2_CALL_TIMEOUT
-            answer = await self._context.nodes.call(caller.endpoint.key(), caller.gid, request, within)
             if answer is None or not answer.ok:
                 text = answer.text if answer is not None else "it is gone"
                 raise RemoteProtocolError(f"the action server of ROS 2 gave no answer to {service}: {text}")
-            self.answered(service, uuid, answer.payload)
+            goals.answered(service, uuid, answer.payload)
         except RmpaError as error:
-            self.failed(service, uuid, str(error))
-        self._timer.arm()
+            goals.failed(service, uuid, str(error))
+        self._arm()
 
 
 def _wrapped(ros1: str, part: str, kind: MessageType) -> TopicDescription:
@@ -388,7 +376,7 @@ def _ignore(_value: object) -> None:
 
 
 class Ros2Actions:
-    """Joins actions both ways. It takes all topics and services of actions, so that no other part carries them."""
+    """Joins actions both ways."""
 
     def __init__(self, context: Ros2Context) -> None:
         self._context = context
@@ -399,11 +387,15 @@ class Ros2Actions:
         # Actions whose server is gone, the last of each name: their topics stay for a moment.
         self._leaving: dict[str, ShownAction] = {}
 
-    def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
+    @staticmethod
+    def takes(source: MeshSource) -> bool:
+        """Whether a source of a module is a topic of an action."""
+        name, _, part = source.here.rpartition("/")
+        return bool(name) and source.kind is SourceKind.TOPIC and source.type.endswith(_TYPES.get(part, "\0"))
+
+    def mesh_source(self, source: MeshSource, *, there: bool) -> None:
         """Take a topic of an action."""
         name, _, part = source.here.rpartition("/")
-        if source.kind is not SourceKind.TOPIC or not name or not source.type.endswith(_TYPES.get(part, "\0")):
-            return False
         topics = self._topics.setdefault(name, {})
         if there:
             topics[source] = part
@@ -416,12 +408,9 @@ class Ros2Actions:
                 shown.follow(self._clients(name))
         if not topics:
             del self._topics[name]
-        return True
 
-    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
+    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> None:
         """Take a service or topic of an action; its *send_goal* stands for the server."""
-        if PART not in endpoint.name:
-            return False
         if endpoint.kind is EntityKind.SERVICE and endpoint.name.endswith(_SEND):
             name = endpoint.name.removesuffix(_SEND)
             shown = self._shown.get(name)
@@ -433,7 +422,6 @@ class Ros2Actions:
                 # The next server of this name takes its place.
                 if (other := next(self._context.ros2.at(endpoint.name, EntityKind.SERVICE), None)) is not None:
                     self._show(name, other)
-        return True
 
     def close(self) -> None:
         """Take back all actions of both sides."""
@@ -459,8 +447,10 @@ class Ros2Actions:
         if name in self._offered or not whole or len(self._offered) >= limits.ROS2_ACTIONS_MAX:
             return
         result = whole[0]["result"]
-        ros1 = action_name(result.type, "ActionResult")
-        if self._context.rules.outgoing_to(SITE, result.module, result.name).allowed and ros1:
+        ros1 = result.type.removesuffix("ActionResult")
+        if ros1.endswith("/"):
+            return  # no action has such a name
+        if self._context.rules.outgoing_to(SITE, result.module, result.name).allowed:
             self._offered[name] = OfferedAction(self._context, name, ros1, whole[0])
 
     def _show(self, name: str, endpoint: Ros2Endpoint) -> None:

@@ -155,8 +155,9 @@ class Ros2Qos:
 
     def serialize(self) -> str:
         """The text in a liveliness token."""
-        usual = Ros2Qos()
-        kinds = (str(int(at)) if (at := getattr(self, name)) != getattr(usual, name) else "" for name, _ in _WORDS)
+        kinds = (
+            str(int(at)) if (at := getattr(self, name)) != getattr(USUAL_QOS, name) else "" for name, _ in _KINDS
+        )
         reliability, durability, history, liveliness = kinds
         deadline, lifespan, lease = (_duration(getattr(self, name)) for name in _TIMES)
         return f"{reliability}:{durability}:{history},{self.depth}:{deadline}:{lifespan}:{liveliness},{lease}"
@@ -171,45 +172,42 @@ class Ros2Qos:
         parts = text.split(":")
         if len(parts) < _PARTS:
             raise RemoteProtocolError(f"the QoS {text[:80]!r} has {len(parts)} parts instead of {_PARTS}")
-        default = cls()
         history, _, depth = parts[2].partition(",")
         liveliness, _, lease = parts[5].partition(",")
         return cls(
-            _kind(Ros2Reliability, parts[0], default.reliability),
-            _kind(Ros2Durability, parts[1], default.durability),
-            _kind(Ros2History, history, default.history),
+            _kind(Ros2Reliability, parts[0], USUAL_QOS.reliability),
+            _kind(Ros2Durability, parts[1], USUAL_QOS.durability),
+            _kind(Ros2History, history, USUAL_QOS.history),
             _number(depth, DEFAULT_DEPTH),
             _duration_nanoseconds(parts[3]),
             _duration_nanoseconds(parts[4]),
-            _kind(Ros2Liveliness, liveliness, default.liveliness),
+            _kind(Ros2Liveliness, liveliness, USUAL_QOS.liveliness),
             _duration_nanoseconds(lease),
         )
 
 
-# The fields of a QoS that are words, and those that are times, as rclpy names them (the lease is shorter here).
-_WORDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
+# The fields of a QoS that are kinds, and those that are times, as rclpy names them (the lease is shorter here).
+_KINDS: Final[tuple[tuple[str, type[IntEnum]], ...]] = (
     ("reliability", Ros2Reliability),
     ("durability", Ros2Durability),
     ("history", Ros2History),
     ("liveliness", Ros2Liveliness),
 )
 _TIMES: Final = ("deadline", "lifespan", "lease")
+# The QoS that rmw gives topics and services.
+USUAL_QOS: Final = Ros2Qos()
 
 
-def qos_fields(qos: Ros2Qos) -> dict[str, str | int]:
-    """The fields of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
-    usual = Ros2Qos()
-    words = {name: getattr(qos, name).name for name, _ in _WORDS if getattr(qos, name) != getattr(usual, name)}
-    times = {name: getattr(qos, name) for name in _TIMES if getattr(qos, name) != INFINITE}
-    return {"depth": qos.depth, **words, **times}
+def qos_fields(qos: Ros2Qos) -> dict[str, int]:
+    """The numbers of a QoS that are not rmw's defaults, and its depth: what the process of rclpy reads."""
+    numbers = {name: int(getattr(qos, name)) for name in (*dict(_KINDS), *_TIMES)}
+    return {"depth": qos.depth, **{name: each for name, each in numbers.items() if each != getattr(USUAL_QOS, name)}}
 
 
 def qos_of_fields(fields: Mapping[str, Any]) -> Ros2Qos:
-    """A QoS as the process of rclpy tells it; words that this version does not know count as the default."""
-    usual = Ros2Qos()
-    words = {name: kind.__members__.get(str(fields.get(name)), getattr(usual, name)) for name, kind in _WORDS}
-    numbers = {name: fields[name] for name in ("depth", *_TIMES) if isinstance(fields.get(name), int)}
-    return Ros2Qos(**words, **numbers)
+    """A QoS as the process of rclpy tells it."""
+    kinds = {name: _known(kind, fields.get(name, 0), getattr(USUAL_QOS, name)) for name, kind in _KINDS}
+    return Ros2Qos(**kinds, **{name: fields[name] for name in ("depth", *_TIMES) if name in fields})
 
 
 def _duration(nanoseconds: int) -> str:
@@ -233,7 +231,10 @@ def _number(text: str, default: int) -> int:
 
 
 def _kind(kind: type[_Kind], text: str, default: _Kind) -> _Kind:
-    number = _number(text, int(default))
+    return _known(kind, _number(text, int(default)), default)
+
+
+def _known(kind: type[_Kind], number: int, default: _Kind) -> _Kind:
     try:
         return kind(number)
     except ValueError:
@@ -350,7 +351,7 @@ class Ros2Node:
 
     def token(self) -> str:
         """The node's liveliness token."""
-        return f"{self._head(self.number, EntityKind.NODE)}"
+        return self._head(self.number, EntityKind.NODE)
 
     def _head(self, number: int, kind: EntityKind) -> str:
         namespace, _, name = self.name.rpartition("/")
@@ -413,28 +414,25 @@ def parse_token(key: str) -> Ros2Node | Ros2Endpoint:
     Raises:
         RemoteProtocolError: It has another form. The parts behind those that are known are ignored.
     """
-    if len(key) > limits.KEY_MAX:
-        raise RemoteProtocolError(f"a liveliness token has {len(key)} characters; at most {limits.KEY_MAX} are read")
     parts = key.split("/")
-    if len(parts) < _NODE_PARTS or parts[0] != ADMIN_SPACE or not all(parts):
-        raise RemoteProtocolError(f"{_short(key)} is not a liveliness token of ROS 2")
-    if not _WILD.isdisjoint(key):
-        raise RemoteProtocolError(f"{_short(key)} is an expression, not a liveliness token")
+    whole = len(key) <= limits.KEY_MAX and len(parts) >= _NODE_PARTS and parts[0] == ADMIN_SPACE and all(parts)
+    if not whole or not _WILD.isdisjoint(key):
+        raise RemoteProtocolError(f"{key[:120]!r} is not a liveliness token of ROS 2")
     try:
         kind = EntityKind(parts[5])
-    except ValueError:
-        raise RemoteProtocolError(f"{_short(key)}: {parts[5][:20]!r} is no kind of entity") from None
-    domain = _token_number(parts[1], _DOMAIN_MAX, key)
+        domain = _token_number(parts[1], _DOMAIN_MAX)
+        session_number, number = (_token_number(part, _ENTITY_ID_MAX) for part in parts[3:5])
+    except ValueError as error:
+        raise RemoteProtocolError(f"{key[:120]!r} is not a liveliness token of ROS 2: {error}") from None
     enclave, namespace, name = (_demangle(part) for part in parts[6:9])
     if not name or "/" in name:
-        raise RemoteProtocolError(f"{_short(key)} has no name of a node")
+        raise RemoteProtocolError(f"{key[:120]!r} has no name of a node")
     full = f"{_absolute(namespace)}/{name}" if namespace else f"/{name}"
-    node = Ros2Node(domain, parts[2], _token_number(parts[3], _ENTITY_ID_MAX, key), full, enclave)
+    node = Ros2Node(domain, parts[2], session_number, full, enclave)
     if kind is EntityKind.NODE:
         return node
     if len(parts) < _ENDPOINT_PARTS:
-        raise RemoteProtocolError(f"{_short(key)} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
-    number = _token_number(parts[4], _ENTITY_ID_MAX, key)
+        raise RemoteProtocolError(f"{key[:120]!r} has {len(parts)} parts; an endpoint's has {_ENDPOINT_PARTS}")
     name = _absolute(_demangle(parts[9]))
     return Ros2Endpoint(node, number, kind, name, ros_type(parts[10]), parts[11], Ros2Qos.parse(parts[12]))
 
@@ -473,11 +471,7 @@ def _absolute(name: str) -> str:
     return name if name.startswith("/") else f"/{name}"
 
 
-def _token_number(text: str, largest: int, key: str) -> int:
+def _token_number(text: str, largest: int) -> int:
     if text.isascii() and text.isdigit() and len(text) <= len(str(largest)) and int(text) <= largest:
         return int(text)
-    raise RemoteProtocolError(f"{_short(key)}: {text[:20]!r} is not a number up to {largest}")
-
-
-def _short(key: str) -> str:
-    return repr(key[:120])
+    raise ValueError(f"{text[:20]!r} is not a number up to {largest}")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -19,13 +18,15 @@ from uuid import UUID
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import ActionPair, ConversionError
+from rmpa.gateway.ros2.conversion import ConversionError
 from rmpa.gateway.ros2.transcoder import HEAD
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.gateway.ros2.link import Query
+    from rmpa.gateway.ros2.actions import OfferedAction, ShownAction
+    from rmpa.gateway.ros2.graph import Query
+    from rmpa.gateway.ros2.pairs import ActionPair
     from rmpa.ros.wire.tcpros import Buffer
     from rmpa.runtime.loop import SystemClock
 
@@ -258,32 +259,6 @@ def _unpack(form: str, raw: Buffer, what: str) -> tuple[Any, ...]:
         raise RemoteProtocolError(f"{len(raw)} bytes are no {what}") from error
 
 
-class Goals(ABC):
-    """The goals of one action, in one direction, without I/O; what a goal causes, the join of the action does."""
-
-    # The action's types, once they are found; no goal comes before.
-    pair: ActionPair
-
-    def __init__(self, clock: SystemClock) -> None:
-        self._clock = clock
-
-    @abstractmethod
-    def tell_ros1(self, topic: str, message: bytes) -> None:
-        """Publish a message for ROS 1."""
-
-    @abstractmethod
-    def server_gone(self) -> None:
-        """The server is gone: all goals end as aborted."""
-
-    @abstractmethod
-    def next_timer(self) -> float | None:
-        """When ``handle_timer`` is to be called; ``None``: not."""
-
-    @abstractmethod
-    def handle_timer(self, now: float) -> None:
-        """Do what is due."""
-
-
 @dataclass(slots=True)
 class _SentToRos1:
     id: GoalId
@@ -302,39 +277,39 @@ class _SentToRos1:
         return self.result is not None
 
 
-class GoalsToRos1(Goals):
-    """The goals of clients of ROS 2 at a server of ROS 1."""
+class GoalsToRos1:
+    """The goals of clients of ROS 2 at a server of ROS 1, without I/O.
 
-    def __init__(self, clock: SystemClock) -> None:
-        super().__init__(clock)
+    Args:
+        action: Does what a goal causes.
+        pair: The action's types.
+        clock: The time.
+    """
+
+    def __init__(self, action: OfferedAction, pair: ActionPair, clock: SystemClock) -> None:
+        self._action = action
+        self._pair = pair
+        self._clock = clock
         # By the id in ROS 1, which is the text of the UUID.
         self._goals: dict[str, _SentToRos1] = {}
-
-    @abstractmethod
-    def tell_ros2(self, topic: str, message: bytes) -> None:
-        """Publish a message for ROS 2."""
-
-    @abstractmethod
-    def answer(self, query: Query, response: bytes) -> None:
-        """Answer a request of a client."""
 
     def send_goal(self, query: Query) -> None:
         """A client calls ``send_goal``."""
         uuid, cdr = split_uuid(query.payload)
-        body, name, stamp = self.pair.goal.to_ros1(cdr), str(UUID(bytes=uuid)), self._clock.wall_ns()
+        body, name, stamp = self._pair.goal.to_ros1(cdr), str(UUID(bytes=uuid)), self._clock.wall_ns()
         if name in self._goals or len(self._goals) >= limits.ROS2_GOALS_MAX:
-            self.answer(query, send_goal_response(stamp, accepted=False))
+            self._action.answer(query, send_goal_response(stamp, accepted=False))
             return
         goal_id = GoalId(name, divmod(stamp, 10**9))
         self._goals[name] = _SentToRos1(goal_id, uuid, self._clock.now() + limits.ROS2_ACCEPT_TIMEOUT, query)
-        self.tell_ros1("goal", ros1_message(stamp, goal_id.serialize(), body))
+        self._action.tell_ros1("goal", ros1_message(stamp, goal_id.serialize(), body))
 
     def get_result(self, query: Query) -> None:
         """A client calls ``get_result``; of a goal that is not known the status is UNKNOWN, as rcl answers."""
         uuid, _ = split_uuid(query.payload)
         goal = self._goals.get(str(UUID(bytes=uuid)))
         if goal is None:
-            self.answer(query, self.pair.result_to_ros2(Ros2Status.UNKNOWN, self.pair.no_result))
+            self._action.answer(query, self._pair.result_to_ros2(Ros2Status.UNKNOWN, self._pair.no_result))
         elif sum(len(each.waiting) for each in self._goals.values()) >= limits.ROS2_GOALS_MAX:
             query.reply_error("too many clients wait for results")
         else:
@@ -350,11 +325,11 @@ class GoalsToRos1(Goals):
         open_goals = [goal for goal in asked if not goal.ended]
         for goal in open_goals:
             # With a stamp ROS 1 would cancel all older goals too.
-            self.tell_ros1("cancel", GoalId(goal.id.id).serialize())
+            self._action.tell_ros1("cancel", GoalId(goal.id.id).serialize())
         code = CancelCode.NONE
         if uuid != ALL_GOALS and not open_goals:
             code = CancelCode.GOAL_ENDED if asked else CancelCode.UNKNOWN_GOAL
-        self.answer(query, cancel_response(code, [(goal.uuid, goal.id) for goal in open_goals]))
+        self._action.answer(query, cancel_response(code, [(goal.uuid, goal.id) for goal in open_goals]))
 
     def status(self, raw: Buffer) -> None:
         """The server publishes its status; a goal that it named before, and names no more, is lost."""
@@ -368,7 +343,7 @@ class GoalsToRos1(Goals):
             if goal.id.id in named:
                 goal.listed = True
             elif goal.listed and not goal.ended:
-                self._end(goal, Ros1Status.LOST, self.pair.no_result)
+                self._end(goal, Ros1Status.LOST, self._pair.no_result)
 
     def feedback(self, raw: Buffer) -> None:
         """The server publishes feedback."""
@@ -377,7 +352,7 @@ class GoalsToRos1(Goals):
         if goal is not None and not goal.ended:
             if self._take_state(state):
                 self._tell_states()
-            self.tell_ros2("feedback", with_uuid(goal.uuid, self.pair.feedback.to_ros2(body)))
+            self._action.tell_ros2("feedback", with_uuid(goal.uuid, self._pair.feedback.to_ros2(body)))
 
     def result(self, raw: Buffer) -> None:
         """The server publishes a result."""
@@ -389,7 +364,7 @@ class GoalsToRos1(Goals):
     def server_gone(self) -> None:
         """The server is gone: all goals end as aborted."""
         for goal in [goal for goal in self._goals.values() if not goal.ended]:
-            self._end(goal, Ros1Status.LOST, self.pair.no_result)
+            self._end(goal, Ros1Status.LOST, self._pair.no_result)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None``: not."""
@@ -403,7 +378,7 @@ class GoalsToRos1(Goals):
                 continue
             if goal.asked is not None:
                 goal.asked.reply_error("the action server of ROS 1 does not show the goal")
-                self.tell_ros1("cancel", GoalId(name).serialize())
+                self._action.tell_ros1("cancel", GoalId(name).serialize())
             del self._goals[name]
             for query in goal.waiting:
                 query.reply_error("the goal is not known any more")
@@ -414,7 +389,7 @@ class GoalsToRos1(Goals):
         if goal is None or goal.ended:
             return False
         if state.status is Ros1Status.REJECTED:
-            self._end(goal, state.status, self.pair.no_result)
+            self._end(goal, state.status, self._pair.no_result)
             return True
         self._accept(goal, accepted=True)
         if state.status not in UNDER_WAY or goal.status is state.status:
@@ -425,7 +400,7 @@ class GoalsToRos1(Goals):
     def _accept(self, goal: _SentToRos1, *, accepted: bool) -> None:
         query, goal.asked = goal.asked, None
         if query is not None:
-            self.answer(query, send_goal_response(self._clock.wall_ns(), accepted=accepted))
+            self._action.answer(query, send_goal_response(self._clock.wall_ns(), accepted=accepted))
 
     def _end(self, goal: _SentToRos1, status: Ros1Status, body: bytes) -> None:
         self._accept(goal, accepted=status is not Ros1Status.REJECTED)
@@ -437,13 +412,13 @@ class GoalsToRos1(Goals):
         waiting, goal.waiting = goal.waiting, []
         for query in waiting:
             try:
-                self.answer(query, self.pair.result_to_ros2(TO_ROS2[goal.status], goal.result or b""))
+                self._action.answer(query, self._pair.result_to_ros2(TO_ROS2[goal.status], goal.result or b""))
             except ConversionError as error:
                 query.reply_error(str(error))
 
     def _tell_states(self) -> None:
         states = ((goal.uuid, goal.id, TO_ROS2[goal.status]) for goal in self._goals.values() if goal.asked is None)
-        self.tell_ros2("status", ros2_states(states))
+        self._action.tell_ros2("status", ros2_states(states))
 
 
 @dataclass(slots=True)
@@ -460,17 +435,15 @@ class _SentToRos2:
         return GoalState(self.id, self.status, self.text)
 
 
-class GoalsToRos2(Goals):
-    """The goals of clients of ROS 1 at a server of ROS 2."""
+class GoalsToRos2:
+    """The goals of clients of ROS 1 at a server of ROS 2, without I/O; arguments as for ``GoalsToRos1``."""
 
-    def __init__(self, clock: SystemClock) -> None:
-        super().__init__(clock)
+    def __init__(self, action: ShownAction, pair: ActionPair, clock: SystemClock) -> None:
+        self._action = action
+        self._pair = pair
+        self._clock = clock
         self._goals: dict[bytes, _SentToRos2] = {}
         self._next_status: float | None = None
-
-    @abstractmethod
-    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
-        """Call a service of the server; ``answered`` or ``failed`` follows."""
 
     def goal(self, raw: Buffer) -> None:
         """A client publishes an ``ActionGoal``."""
@@ -488,7 +461,7 @@ class GoalsToRos2(Goals):
             return
         self._goals[uuid] = goal
         try:
-            self.ask("send_goal", uuid, with_uuid(uuid, self.pair.goal.to_ros2(body)))
+            self._action.ask("send_goal", uuid, with_uuid(uuid, self._pair.goal.to_ros2(body)))
         except ConversionError as error:
             self._end(goal, Ros1Status.REJECTED, str(error))
 
@@ -500,7 +473,7 @@ class GoalsToRos2(Goals):
             if goal.ended is None and (goal.id.id == asked.id or older or asked == GoalId()) and not goal.cancelled:
                 goal.cancelled = True
                 if goal.status is not Ros1Status.PENDING:
-                    self.ask("cancel_goal", goal.uuid, cancel_request(goal.uuid))
+                    self._action.ask("cancel_goal", goal.uuid, cancel_request(goal.uuid))
 
     def answered(self, service: str, uuid: bytes, response: bytes) -> None:
         """The server has answered ``send_goal``, ``get_result`` or ``cancel_goal``; late answers are ignored."""
@@ -536,7 +509,7 @@ class GoalsToRos2(Goals):
         uuid, cdr = split_uuid(raw)
         goal = self._goals.get(uuid)
         if goal is not None and goal.ended is None:
-            self._tell("feedback", goal, self.pair.feedback.to_ros1(cdr))
+            self._tell("feedback", goal, self._pair.feedback.to_ros1(cdr))
 
     def status(self, raw: Buffer) -> None:
         """The server publishes its status: of goals under way ROS 1 is told that they are being preempted."""
@@ -569,13 +542,13 @@ class GoalsToRos2(Goals):
             return
         goal.status = Ros1Status.ACTIVE
         self._tell_states()
-        self.ask("get_result", goal.uuid, with_uuid(goal.uuid, b"\x00\x01\x00\x00"))
+        self._action.ask("get_result", goal.uuid, with_uuid(goal.uuid, b"\x00\x01\x00\x00"))
         if goal.cancelled:
-            self.ask("cancel_goal", goal.uuid, cancel_request(goal.uuid))
+            self._action.ask("cancel_goal", goal.uuid, cancel_request(goal.uuid))
 
     def _result(self, goal: _SentToRos2, response: bytes) -> None:
         try:
-            number, body = self.pair.result_to_ros1(response)
+            number, body = self._pair.result_to_ros1(response)
             status = TO_ROS1[Ros2Status(number)]
         except (ConversionError, ValueError) as error:
             self._end(goal, Ros1Status.ABORTED, str(error))
@@ -584,12 +557,12 @@ class GoalsToRos2(Goals):
 
     def _tell_states(self) -> None:
         states = (goal.state for goal in self._goals.values())
-        self.tell_ros1("status", ros1_states(self._clock.wall_ns(), states))
+        self._action.tell_ros1("status", ros1_states(self._clock.wall_ns(), states))
 
     def _end(self, goal: _SentToRos2, status: Ros1Status, text: str, body: bytes | None = None) -> None:
         goal.status, goal.text, goal.ended = status, text, self._clock.now()
         self._tell_states()
-        self._tell("result", goal, self.pair.no_result if body is None else body)
+        self._tell("result", goal, self._pair.no_result if body is None else body)
 
     def _tell(self, topic: str, goal: _SentToRos2, body: bytes) -> None:
-        self.tell_ros1(topic, ros1_message(self._clock.wall_ns(), goal.state.serialize(), body))
+        self._action.tell_ros1(topic, ros1_message(self._clock.wall_ns(), goal.state.serialize(), body))

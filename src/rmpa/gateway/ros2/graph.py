@@ -1,34 +1,55 @@
-"""ROS 2's graph: what its tokens tell, what the gateway declares there, and types that its nodes are asked for."""
+"""ROS 2's graph: the way to it, what its tokens tell, and what the gateway declares there.
+
+The way is a Zenoh session, or a process with rclpy (``rclpy_session``): both have endpoints, messages and calls by
+rmw_zenoh's tokens and keys.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import re
 import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.bridge.policy import Needs
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, parse_token
-from rmpa.gateway.ros2.pairs import described_types
-from rmpa.gateway.ros2.types import SERVICE, parse_type_response, type_request
+from rmpa.gateway.ros2.format import (
+    NO_HASH,
+    USUAL_QOS,
+    EntityKind,
+    Ros2Attachment,
+    Ros2Endpoint,
+    Ros2Node,
+    parse_token,
+)
 from rmpa.gateway.zenoh.threads import first_answer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from contextlib import ExitStack
+    from typing import TypeAlias
 
     from rmpa.gateway.ros2.format import Ros2Qos
-    from rmpa.gateway.ros2.link import Declared, Ros2Link
-    from rmpa.gateway.ros2.types import Ros2Types
-    from rmpa.gateway.zenoh.threads import ZenohReply
+    from rmpa.gateway.ros2.rclpy_session import RclpyPublisher, RclpyQuery, RclpySession
+    from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
+    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
+
+    Ros2Link: TypeAlias = OpenSession | RclpySession
+    Declared: TypeAlias = Declaration | ExitStack
+    Publishing: TypeAlias = QueuedPublisher | RclpyPublisher
+    Query: TypeAlias = ArrivedQuery | RclpyQuery
 
 # The name of ROS 2 among the sites, in rules and in the names of proxies; it is ``{module}`` too.
 SITE: Final = ROS2
+_NEEDS: Final = Needs(
+    (),
+    "`[[gateway.rule]]` for `ros2` alone: ROS 2 has no permissions",
+    key="services and actions of ROS 2",
+)
 
 
 # Two endpoints of one name that do not hear each other, as their keys differ. ROS 2 itself says nothing.
@@ -73,6 +94,7 @@ def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
 # 2 node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no
 # loop.
 OWN_NAMESPACE: Final = "/rmpa/"
+_OTHER_GATEWAY: Final = "other gateway"
 _NAME: Final = re.compile(r"(/[A-Za-z0-9_]+)+")
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
 
@@ -94,9 +116,8 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
-        # By the name of a node the tokens and sessions of other gateways that show it.
-        self._rivals: dict[str, dict[str, str]] = {}
-        self._rival_tokens = 0
+        # The nodes that other gateways show.
+        self._rivals: dict[str, Ros2Node] = {}
         self.ignored: Counter[str] = Counter()
 
     @property
@@ -112,55 +133,30 @@ class Ros2Graph:
         """The endpoints of a topic or service, of the given kinds, in the order in which they appeared."""
         return (each for each in self._by_name.get(name, {}).values() if each.kind in kinds)
 
-    def rival(self, key: str, *, alive: bool) -> str:
-        """Take in that another gateway's node appeared or disappeared.
-
-        Returns:
-            The node's name; empty if the token is no such one.
-        """
-        try:
-            node = parse_token(key)
-        except RemoteProtocolError:
-            return ""
-        if not isinstance(node, Ros2Node) or node.zid == self._own_zid or node.domain != self._domain:
-            return ""
-        shown = self._rivals.get(node.name, {})
-        if not node.name.startswith(OWN_NAMESPACE) or alive == (key in shown):
-            return ""
-        if alive and self._rival_tokens >= limits.ROS2_NODES_MAX:
-            return ""
-        self._rival_tokens += 1 if alive else -1
-        if alive:
-            self._rivals.setdefault(node.name, {})[key] = node.zid
-        else:
-            del shown[key]
-            if not shown:
-                del self._rivals[node.name]
-        return node.name
-
     def led_by(self, node: str) -> str:
         """The Zenoh session of another gateway that shows a module's node; empty if this gateway is to show it.
 
         Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
         node the one with the least session id goes on.
         """
-        shown = self._rivals.get(node, {}).values()
+        shown = (each.zid for each in self._rivals.values() if each.name == node)
         return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:
         """Take in that a token appeared or disappeared.
 
         Returns:
-            The node or endpoint that is new or gone; ``None`` if nothing has changed.
+            The node or endpoint that is new or gone, also a node that another gateway shows; ``None`` if nothing has
+            changed.
         """
         if not alive:
-            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None)
+            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None) or self._rivals.pop(key, None)
             if isinstance(gone, Ros2Endpoint):
                 del self._by_name[gone.name][key]
                 if not self._by_name[gone.name]:
                     del self._by_name[gone.name]
             return gone
-        if key in self._nodes or key in self._endpoints:
+        if key in self._nodes or key in self._endpoints or key in self._rivals:
             return None
         try:
             entity = parse_token(key)
@@ -172,7 +168,10 @@ class Ros2Graph:
             return None
         if reason := self._problem(node, entity):
             self.ignored[reason] += 1
-            return None
+            if reason != _OTHER_GATEWAY or node is not entity or len(self._rivals) >= limits.ROS2_NODES_MAX:
+                return None
+            self._rivals[key] = node
+            return node
         if isinstance(entity, Ros2Node):
             self._nodes[key] = entity
         else:
@@ -187,7 +186,7 @@ class Ros2Graph:
         if not _valid(node.name):
             return "impossible name"
         if f"{node.name}/".startswith(OWN_NAMESPACE):
-            return "other gateway"
+            return _OTHER_GATEWAY
         if isinstance(entity, Ros2Node):
             return "too many nodes" if len(self._nodes) >= limits.ROS2_NODES_MAX else ""
         if not _valid(entity.name) or _TYPE.fullmatch(entity.type) is None:
@@ -220,25 +219,34 @@ _NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
 class OwnEndpoint:
-    """One endpoint with its token in ROS 2's graph.
+    """One endpoint with its token in ROS 2's graph, and with what takes what comes for it.
 
     Args:
         nodes: The node's owner.
         endpoint: The endpoint.
         gid: What its messages, requests or replies have in their attachment.
+        taking: What takes messages or calls; ``None``: none come.
     """
 
-    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid: bytes) -> None:
+    def __init__(self, nodes: OwnRos2Nodes, endpoint: Ros2Endpoint, gid: bytes, taking: Declared | None) -> None:
         self.endpoint = endpoint
         self.gid = gid
         self._nodes = nodes
-        self._token: Declared | None = nodes.session.token(endpoint.token())
+        self._declared: list[Declared] = [
+            nodes.session.token(endpoint.token()),
+            *([] if taking is None else [taking]),
+        ]
+
+    async def call(self, request: Buffer, within: float) -> ZenohSample | None:
+        """Call its service as this client; ``None``: it gave no answer in ``within`` seconds."""
+        return await self._nodes.call(self.endpoint.key(), self.gid, request, within)
 
     def close(self) -> None:
-        """Take its token back, and its node's if it was the last of it."""
-        if self._token is not None:
-            self._token.close()
-            self._token = None
+        """Take it back, and its node's token if it was the last of it."""
+        declared, self._declared = self._declared, []
+        for each in declared:
+            each.close()
+        if declared:
             self._nodes.release(self.endpoint.node)
 
 
@@ -268,7 +276,15 @@ class OwnRos2Nodes:
         self._uses: Counter[str] = Counter()
 
     def declare(
-        self, node: str, kind: EntityKind, name: str, type_name: str, type_hash: str, qos: Ros2Qos
+        self,
+        node: str,
+        kind: EntityKind,
+        name: str,
+        types: tuple[str, str],
+        qos: Ros2Qos = USUAL_QOS,
+        *,
+        take: Callable[[Any], object] | None = None,
+        history: bool = False,
     ) -> OwnEndpoint:
         """Declare an endpoint, and its node if it is the first of it.
 
@@ -276,21 +292,27 @@ class OwnRos2Nodes:
             node: The node's full name, ``/rmpa/<module>/<node>`` or ``own_name``.
             kind: What it is.
             name: The topic or service, ``/like/this``.
-            type_name: ``package/msg/Name`` or ``package/srv/Name``.
-            type_hash: The hash of the type.
+            types: ``package/msg/Name`` or ``package/srv/Name``, and the hash of that type.
             qos: Its QoS.
+            take: Called with each message of a subscription (``ZenohSample``), or each call of a service (``Query``).
+            history: Whether a subscription gets what publishers keep.
         """
         if node not in self._nodes:
             made = Ros2Node(self._domain, self.session.zid, next(self._numbers), node)
             self._nodes[node] = (made, self.session.token(made.token()))
         self._uses[node] += 1
         owner = self._nodes[node][0]
-        endpoint = Ros2Endpoint(owner, next(self._numbers), kind, name, type_name, type_hash, qos)
+        endpoint = Ros2Endpoint(owner, next(self._numbers), kind, name, *types, qos)
         gid = gid_of(endpoint.token(), self._gid_bytes)
         self.gids.add(gid)
-        return OwnEndpoint(self, endpoint, gid)
+        taking: Declared | None = None
+        if take is not None and kind is EntityKind.SERVICE:
+            taking = self.session.queryable(endpoint.key(), take, _NEEDS)  # a client may call once it sees the token
+        elif take is not None:
+            taking = self.session.subscribe(endpoint.key(), take, history=history)
+        return OwnEndpoint(self, endpoint, gid, taking)
 
-    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohReply | None:
+    async def call(self, key: str, gid: bytes, request: Buffer, within: float) -> ZenohSample | None:
         """Call a service of ROS 2 as the client with a GID; ``None``: it gave no answer in ``within`` seconds."""
         attachment = Ros2Attachment(next(self._calls), time.time_ns(), gid).serialize()
         return first_answer(await self.session.get(key, request, attachment, timeout=within, all_complete=True))
@@ -308,99 +330,3 @@ def gid_of(token: str, size: int = 16) -> bytes:
     import xxhash  # noqa: PLC0415 - of the extra "zenoh"
 
     return int(xxhash.xxh3_128_intdigest(token.encode())).to_bytes(16, "little").ljust(size, b"\0")
-
-
-# Asks nodes of ROS 2 for the fields of types that are not known here, by their service ``get_type_description``.
-
-
-class Ros2TypeAsker:
-    """Asks for types; at most ``limits.ROS2_ASKS_MAX`` nodes at one time.
-
-    Args:
-        nodes: Our nodes in ROS 2's graph.
-        ros2: ROS 2's graph.
-        types: The types of ROS 2's distribution.
-    """
-
-    def __init__(self, nodes: OwnRos2Nodes, ros2: Ros2Graph, types: Ros2Types) -> None:
-        self._nodes = nodes
-        self._ros2 = ros2
-        self._types = types
-        self._appeared = asyncio.Event()
-        self._asking = 0
-
-    def appeared(self) -> None:
-        """An endpoint is new in ROS 2's graph."""
-        if self._asking:
-            self._appeared.set()
-            self._appeared = asyncio.Event()
-
-    async def learn(self, *endpoints: tuple[str, EntityKind], of: Ros2Endpoint) -> dict[str, Any]:
-        """The fields of the types of some endpoints of one node, which waits for those that have not appeared yet.
-
-        Args:
-            endpoints: The names and kinds of the endpoints; none: the type of ``of`` itself is meant.
-            of: An endpoint of the node, which has appeared.
-
-        Returns:
-            The fields of the types and of all that they embed, in rosbags' form; each type has the hash of its key.
-
-        Raises:
-            NoConversion: The node does not describe them, or describes others.
-            RemoteProtocolError: Its answer is malformed.
-        """
-        found: dict[str, Any] = {}
-        if self._asking >= limits.ROS2_ASKS_MAX:
-            raise NoConversion(f"{self._asking} ROS 2 nodes are asked for types already; this one is not")
-        self._asking += 1
-        try:
-            for name, kind in endpoints or ((of.name, of.kind),):
-                endpoint = of if (name, kind) == (of.name, of.kind) else await self._wait(name, kind, of.node)
-                if endpoint is None:
-                    raise NoConversion(f"node {of.node.name} has no {name}")
-                fields = await self._ask(endpoint)
-                described_types(self._types, endpoint.type, endpoint.type_hash, fields)
-                found |= fields
-        finally:
-            self._asking -= 1
-        return found
-
-    async def _ask(self, endpoint: Ros2Endpoint) -> dict[str, Any]:
-        server = await self._wait(f"{endpoint.node.name}/{SERVICE}", EntityKind.SERVICE, endpoint.node)
-        if server is None:
-            raise NoConversion(self._unknown(endpoint))
-        answer = await self.call(server, type_request(endpoint.type, endpoint.type_hash))
-        if answer is None or not answer.ok:
-            raise NoConversion(f"{server.name} does not answer; {self._unknown(endpoint)}")
-        return parse_type_response(answer.payload)
-
-    async def call(self, server: Ros2Endpoint, request: bytes) -> ZenohReply | None:
-        """Call one of the services that each node has; ``None``: it has not answered in time."""
-        gid = gid_of(f"{self._nodes.own_name}/{SERVICE}")
-        return await self._nodes.call(server.key(), gid, request, limits.ROS2_SERVICE_WAIT)
-
-    async def _wait(self, name: str, kind: EntityKind, node: Ros2Node) -> Ros2Endpoint | None:
-        """An endpoint of a node, once it is there; ``None`` if it does not appear."""
-        try:
-            async with asyncio.timeout(limits.ROS2_SERVICE_WAIT):
-                while True:
-                    for found in self._ros2.at(name, kind):
-                        if found.node.name == node.name:
-                            return found
-                    await self._appeared.wait()
-        except TimeoutError:
-            return None
-
-    def _unknown(self, endpoint: Ros2Endpoint) -> str:
-        distribution = self._types.distribution
-        if endpoint.type in self._types:
-            return (
-                f"its type hash {endpoint.type_hash} is not that of {distribution}'s {endpoint.type}, and node "
-                f"{endpoint.node.name} offers no get_type_description: set gateway.ros2.distribution to the one of "
-                "that node, or start it with the parameter start_type_description_service"
-            )
-        return (
-            f"the fields of {endpoint.type} are not known, and node {endpoint.node.name} offers no "
-            "get_type_description: start the node with the parameter start_type_description_service, or source a "
-            "ROS 1 workspace that has the type, with the same fields, where the gateway runs"
-        )

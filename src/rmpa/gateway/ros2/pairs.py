@@ -1,4 +1,4 @@
-"""Finds the pair of each type, by name or by ros1_bridge's mapping files, and keeps the conversions.
+"""Finds the pair of each type, by name or by ros1_bridge's mapping files, with the conversions of its parts.
 
 A pair is found by name and rule; the fields are those of ROS 2's distribution, of a definition that a ROS 1 publisher
 sent, or of a description that a ROS 2 node gave.
@@ -12,11 +12,13 @@ their keys are made as its others are.
 
 from __future__ import annotations
 
+import asyncio
 import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import yaml
+from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import TypesysError
 
 from rmpa.config.writers import check_writers
@@ -25,7 +27,8 @@ from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion, NoConversion
 from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, FieldPaths, TypePair, check_size, ros2_fields, ros2_name
-from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, known_text, known_types
+from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, Specification, known_text, known_types
+from rmpa.ros.types.find import find_message_type, find_service_type
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 
@@ -58,6 +61,15 @@ _USUAL: Final = {
     "roscpp/Empty": "std_srvs/srv/Empty",
     "actionlib_tutorials/Fibonacci": "example_interfaces/action/Fibonacci",
 }
+# Stands between an action's name and those of its services and topics in ROS 2.
+PART: Final = "/_action/"
+# What the definition of an action is made of.
+_GOAL_PARTS: Final = ("Goal", "Result", "Feedback")
+CANCEL_TYPE: Final = "action_msgs/srv/CancelGoal"
+STATUS_TYPE: Final = "action_msgs/msg/GoalStatusArray"
+_UUID: Final = ("goal_id", (Nodetype.NAME, "unique_identifier_msgs/msg/UUID"))
+_TIME: Final = ("stamp", (Nodetype.NAME, "builtin_interfaces/msg/Time"))
+_INFO: Final = (Nodetype.NAME, "action_msgs/msg/GoalInfo")
 _LOG: Final = "rosgraph_msgs/Log"
 _LOG_FIELDS: Final[FieldPaths] = {
     "header.stamp": "stamp",
@@ -250,7 +262,7 @@ class Ros2Pairs:
 
     def __init__(self, types: Ros2Types, mapping: TypeMapping, find: Callable[[str], MessageType]) -> None:
         self._types = types
-        self._mapping = mapping
+        self.mapping = mapping
         self._find = find
         self._ros1: dict[str, MessageType] = {}
         self._variants: dict[tuple[str, str], Ros2Types] = {}
@@ -270,7 +282,7 @@ class Ros2Pairs:
         Raises:
             NoConversion: A rule maps it to a type that is not known here.
         """
-        pair = self._mapping.message(name, self._types)
+        pair = self.mapping.message(name, self._types)
         return None if pair is None else (pair.name, self._hash(name, pair))
 
     def learn(self, kind: MessageType) -> tuple[str, str]:
@@ -304,7 +316,7 @@ class Ros2Pairs:
         name = "" if key in self._out else self.learn(kind)[0]
 
         def make() -> Conversion:
-            pair = self._mapping.message(kind.name, self._types)
+            pair = self.mapping.message(kind.name, self._types)
             return Conversion(kind, name, self._types, pair.fields if pair is not None else None)
 
         return self._kept(self._out, key, make)
@@ -320,7 +332,7 @@ class Ros2Pairs:
 
     def ros1_name(self, name: str) -> str:
         """The name of ROS 1 for a type of ROS 2, ``package/msg/Name``."""
-        return self._mapping.ros1_type(name, (*known_types(), *self._ros1))
+        return self.mapping.ros1_type(name, (*known_types(), *self._ros1))
 
     def incoming(self, name: str, type_hash: str) -> Conversion | None:
         """The conversion of a type of ROS 2.
@@ -387,7 +399,7 @@ class Ros2Pairs:
                 ros1 = derive_ros1(types.store, name, self.ros1_name)
             except (RmpaError, KeyError) as error:
                 raise NoConversion(f"{name} has no form in ROS 1: {error}") from error
-        pair = self._mapping.message(name1, types.store.fielddefs)
+        pair = self.mapping.message(name1, types.store.fielddefs)
         return Conversion(ros1, name, types, pair.fields if pair is not None and pair.name == name else None)
 
     def _ros1_type(self, name: str) -> MessageType | None:
@@ -428,3 +440,141 @@ def described_types(types: Ros2Types, name: str, type_hash: str, fields: Mapping
     if hashed != type_hash:
         raise NoConversion(f"the description of {name} has the type hash {hashed}, its endpoint {type_hash}")
     return variant
+
+
+async def find_types(*names: str) -> list[MessageType]:
+    """Find types of ROS 1; raises ``RmpaError`` if a definition is missing."""
+    return [await asyncio.to_thread(find_message_type, name) for name in names]
+
+
+class ServicePair:
+    """Converts the calls of one service type.
+
+    Args:
+        ros1: The type of ROS 1.
+        pair: Its counterpart.
+        types: ROS 2's types; the service type is learnt from ROS 1's fields if it is not known.
+
+    Attributes:
+        type_hash: The hash in keys and tokens.
+        request: Converts requests.
+        response: Converts responses.
+
+    Raises:
+        NoConversion: The types are no pair.
+    """
+
+    derive = staticmethod(derive_service)
+
+    @staticmethod
+    async def find(name: str) -> ServiceType:
+        """The type of ROS 1 on this machine; raises ``RmpaError`` if there is none."""
+        return await asyncio.to_thread(find_service_type, name)
+
+    def __init__(self, ros1: ServiceType, pair: TypePair, types: Ros2Types) -> None:
+        if pair.paths and pair.name not in types:
+            raise NoConversion(
+                f"the rule of {ros1.name} maps fields to {pair.name}, whose definition is not known here: "
+                "source the ROS 2 workspace that has it"
+            )
+        self.ros1 = ros1
+        self.ros2 = pair.name
+        self.type_hash = types.service_hash(ros1, pair.name)
+        self.request = Conversion(ros1.request, f"{pair.name}_Request", types, pair.paths.get("request"))
+        self.response = Conversion(ros1.response, f"{pair.name}_Response", types, pair.paths.get("response"))
+
+
+class ActionPair:
+    """Converts goals, results and feedback of one action type.
+
+    Args:
+        kinds: ROS 1's goal, result and feedback, without their wrapping.
+        rule: Its counterpart, ``package/action/Name``, and the fields if a mapping file lists them.
+        types: ROS 2's types; the action's are learnt from ROS 1's fields if they are not known.
+
+    Attributes:
+        name: ``package/action/Name`` of ROS 2.
+        ros1: ``package/Name`` of ROS 1.
+        types: The type of each service and topic in ROS 2, and its hash.
+        type_hash: That of *send_goal*.
+        goal: Converts goals, without the id.
+        feedback: Converts feedback, without the id.
+        result: ROS 1's result.
+        no_result: A result of ROS 1 without values, for goals that have none.
+
+    Raises:
+        NoConversion: The types are no pair.
+    """
+
+    @staticmethod
+    async def find(name: str) -> list[MessageType]:
+        """Goal, result and feedback of an action of ROS 1 on this machine; errors as for ``find_types``."""
+        return await find_types(*(f"{name}{part}" for part in _GOAL_PARTS))
+
+    @staticmethod
+    def derive(store: Typestore, name: str, own: str, name1: Callable[[str], str]) -> list[MessageType]:
+        """Make these of an action of ROS 2; arguments and errors as for ``derive_service``."""
+        ros1 = {f"{name}_{part}": f"{own}{part}" for part in _GOAL_PARTS}
+        return [derive_ros1(store, each, lambda it: ros1.get(it) or name1(it)) for each in ros1]
+
+    def __init__(self, kinds: Sequence[MessageType], rule: TypePair, types: Ros2Types) -> None:
+        goal, result, feedback = kinds
+        self.name: Final = rule.name
+        self.ros1: Final = goal.name.removesuffix("Goal")
+        if rule.paths and f"{rule.name}_Goal" not in types:
+            raise NoConversion(
+                f"the rule of {self.ros1} maps fields to {rule.name}, whose definition is not known here"
+            )
+        for part, kind in zip(_GOAL_PARTS, kinds, strict=True):
+            types.learn({name: each for name, each in kind.specifications.items() if name != kind.name})
+            types.define_as(f"{rule.name}_{part}", kind.specifications[kind.name])
+        self.types: Final = _define(rule.name, types)
+        self.type_hash: Final = self.types["send_goal"][1]
+        self.goal: Final = Conversion(goal, f"{rule.name}_Goal", types, rule.paths.get("goal"))
+        self.feedback: Final = Conversion(feedback, f"{rule.name}_Feedback", types, rule.paths.get("feedback"))
+        self.result: Final = result
+        wrapped = f"{self.ros1}GetResultResponse"
+        both = Specification.parse(wrapped, f"int8 status\n{result.name} result\n")
+        paths = rule.paths.get("result")
+        if paths is not None:
+            paths = {"status": "status", **{f"result.{one}": f"result.{two}" for one, two in paths.items()}}
+        known = {**result.specifications, wrapped: both}
+        self._result = Conversion(MessageType(wrapped, known), f"{rule.name}_GetResult_Response", types, paths)
+        self.no_result: Final = result.serialize(result.make(None))
+
+    def result_to_ros2(self, status: int, result: bytes) -> bytes:
+        """``GetResult_Response``.
+
+        Raises:
+            ConversionError: The result does not fit ROS 2's type.
+        """
+        return self._result.to_ros2(bytes((status,)) + result)
+
+    def result_to_ros1(self, raw: bytes) -> tuple[int, bytes]:
+        """Status and result of a ``GetResult_Response``.
+
+        Raises:
+            ConversionError: The bytes are no such response.
+        """
+        made = self._result.to_ros1(raw)
+        return made[0], made[1:]
+
+
+def _define(name: str, types: Ros2Types) -> dict[str, tuple[str, str]]:
+    """Define the types of one action of ROS 2, as rosidl_parser does."""
+    own: dict[str, Any] = {part: (Nodetype.NAME, f"{name}_{part}") for part in _GOAL_PARTS}
+    number = (Nodetype.BASE, ("int8", 0))
+    sent = [("accepted", (Nodetype.BASE, ("bool", 0))), _TIME]
+    types.define_service(f"{name}_SendGoal", [_UUID, ("goal", own["Goal"])], sent)
+    types.define_service(f"{name}_GetResult", [_UUID], [("status", number), ("result", own["Result"])])
+    types.take({f"{name}_FeedbackMessage": ([], [_UUID, ("feedback", own["Feedback"])])})
+    cancelled = [("return_code", number), ("goals_canceling", (Nodetype.SEQUENCE, (_INFO, 0)))]
+    types.define_service(CANCEL_TYPE, [("goal_info", _INFO)], cancelled)
+    kinds = {
+        "send_goal": f"{name}_SendGoal",
+        "get_result": f"{name}_GetResult",
+        "cancel_goal": CANCEL_TYPE,
+        "feedback": f"{name}_FeedbackMessage",
+        "status": STATUS_TYPE,
+    }
+    return {part: (kind, types.type_hash(kind)) for part, kind in kinds.items()}

@@ -11,11 +11,12 @@ import asyncio
 import itertools
 import json
 import logging
-import os
 import random
 import socket
 import struct
 from collections import Counter
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -38,8 +39,7 @@ from rmpa.gateway.ros2.format import (
     ros_type,
 )
 from rmpa.gateway.ros2.graph import OWN_NAMESPACE, gid_of
-from rmpa.gateway.ros2.rclpy_query import CALL, RclpyQuery
-from rmpa.gateway.zenoh.threads import ZenohReply, ZenohSample
+from rmpa.gateway.zenoh.threads import ZenohSample
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.bridge.policy import Needs
-    from rmpa.gateway.zenoh.threads import ZenohPriority, ZenohQos
+    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.runtime.tls import Buffer
 
 _log = logging.getLogger(__name__)
@@ -55,6 +55,8 @@ _PROTOCOL: Final = 1
 _HEAD: Final = struct.Struct("<IBI")
 _STAMPS: Final = struct.Struct("<qq")
 _MESSAGE: Final = ord("M")
+# The number of a call.
+_CALL: Final = struct.Struct("<Q")
 # Bytes of the head behind the length.
 _SHORT: Final = 5
 # Seconds for the child's first frame: DDS libraries load slowly on small computers.
@@ -82,17 +84,64 @@ def _without_hash(key: str) -> str:
     return key.rpartition("/")[0]
 
 
-class _Closer:
-    """Something that is taken back once; the other declarations of a session have more to do."""
+def _closing(end: Callable[[], object]) -> ExitStack:
+    """Something that is taken back once."""
+    made = ExitStack()
+    made.callback(end)
+    return made
 
-    def __init__(self, end: Callable[[], None]) -> None:
-        self._end: Callable[[], None] | None = end
 
-    def close(self) -> None:
-        """Take it back."""
-        end, self._end = self._end, None
-        if end is not None:
-            end()
+@dataclass(slots=True)
+class _Own:
+    """An endpoint that is declared here.
+
+    Attributes:
+        key: Of its messages or calls.
+        unmade: Whether the child could not make it.
+        publisher: What has sent for it; its queue has the bounds of that.
+        kept: Its last message, if it is latched: for a child that is started again.
+    """
+
+    endpoint: Ros2Endpoint
+    key: str
+    unmade: bool = False
+    publisher: RclpyPublisher | None = None
+    kept: bytes | None = None
+
+
+class RclpyQuery:
+    """A call of a ROS 2 client, to be answered once.
+
+    Args:
+        answer: Sends the call's number, whether it succeeded (1 byte), and the response as CDR.
+        call: The call's number.
+        key: The service's.
+        request: As CDR.
+    """
+
+    def __init__(self, answer: Callable[[bytes], object], call: bytes, key: str, request: bytes) -> None:
+        self._answer = answer
+        self._call = call
+        self.key = key
+        self.payload = request
+        self.attachment = Ros2Attachment(_CALL.unpack(call)[0], 0, bytes(16)).serialize()
+
+    def reply(self, payload: Buffer, _attachment: bytes = b"") -> None:
+        """Give the answer."""
+        self._finish(b"\1", bytes(payload))
+
+    def reply_error(self, _text: str) -> None:
+        """Give up: ROS 2 has no response that says that a call has failed, and its client goes on waiting."""
+        self._finish(b"\0", b"")
+
+    def finish(self) -> None:
+        """No answer follows."""
+        self._finish(b"\0", b"")
+
+    def _finish(self, succeeded: bytes, payload: bytes) -> None:
+        call, self._call = self._call, b""
+        if call:
+            self._answer(call + succeeded + payload)
 
 
 class RclpyPublisher:
@@ -108,37 +157,30 @@ class RclpyPublisher:
         self._qos = qos
         self._matching = matching
         self._matched = False
-        # The endpoints that have sent, and whose queues are bounded.
-        self._used: set[int] = set()
         self.dropped = 0
 
     @property
     def waiting(self) -> int:
         """Messages in its queue."""
-        return sum(map(self._session.outbox.waiting, self._used))
+        own, waiting = self._session.own.items(), self._session.outbox.waiting
+        return sum(waiting(number) for number, each in own if each.publisher is self)
 
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        """Queue one message; return how many older ones were dropped."""
-        return self.put_all(((bytes(payload), attachment),))
-
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        """Queue messages; return how many older ones were dropped."""
-        dropped = 0
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Queue messages."""
         for payload, attachment in messages:
-            number = self._session.number_of(Ros2Attachment.parse(attachment).gid)
+            number = self._session.by_gid.get(Ros2Attachment.parse(attachment).gid)
             if number is not None:
-                if number not in self._used:
-                    self._used.add(number)
+                own = self._session.own[number]
+                if own.publisher is not self:
+                    own.publisher = self
                     self._session.outbox.set_terms(number, self._qos.messages)
-                dropped += self._session.write("M", number, payload)
+                self.dropped += self._session.write("M", number, payload)
                 if self._qos.cache:
-                    self._session.kept[number] = payload
-        self.dropped += dropped
-        return dropped
+                    own.kept = payload
 
     def judge(self) -> None:
         """Tell whether a node of ROS 2 subscribes, if that has changed."""
-        there = self._session.subscribed(self._key)
+        there = self._session.wanted[_without_hash(self._key)] > 0
         if there != self._matched:
             self._matched = there
             self._matching(there)
@@ -161,18 +203,20 @@ class RclpySession:
         zid: Identifies this session among gateways: the participant of DDS, in hexadecimal digits.
         problem: Why there is no child; empty: there is one.
         outbox: What waits for the child, by endpoint.
+        own: What is declared here, by the numbers of frames.
+        by_gid: These numbers by GID.
         publishers: Those that are open.
-        kept: The last message of each latched endpoint, for a child that is started again.
+        wanted: The number of ROS 2's subscriptions by their keys without the hash.
     """
 
     # More than twelve fields: the child with its stream, what is declared, what ROS 2 has, and the calls under way.
 
-    def __init__(self, python: str, domain: int, name: str, environ: dict[str, str] | None = None) -> None:
+    def __init__(self, python: str, domain: int, name: str, environ: dict[str, str]) -> None:
         self._tasks = OwnedTasks()
         self._python = python
         self._domain = domain
         self._name = name
-        self._environ = dict(os.environ if environ is None else environ)
+        self._environ = environ
         self.stale = False
         self.zid = f"{random.getrandbits(96):024x}"
         self.hash_of: Callable[[str], str] = lambda _: NO_HASH
@@ -182,28 +226,24 @@ class RclpySession:
         self.outbox = Outbox(1000, 64 << 20)
         self._stream: Stream | None = None
         self._process: asyncio.subprocess.Process | None = None
-        self._ready: asyncio.Future[None] | None = None
+        self._ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._ended = asyncio.Event()
         self._numbers = itertools.count(1)
-        self._declared: dict[int, Ros2Endpoint] = {}
-        self._keys: dict[int, str] = {}
-        # Those that the child could not make.
-        self._unmade: set[int] = set()
-        # The subscriptions of ROS 2 by their keys without the hash.
-        self._wanted: Counter[str] = Counter()
-        self._by_gid: dict[bytes, int] = {}
+        self.own: dict[int, _Own] = {}
+        self.by_gid: dict[bytes, int] = {}
+        self.wanted: Counter[str] = Counter()
+        # Of services that are called without a declared client, by their keys.
         self._clients: dict[str, int] = {}
         self.publishers: set[RclpyPublisher] = set()
-        self.kept: dict[int, bytes] = {}
-        self._subscribers: dict[str, list[Callable[[ZenohSample], None]]] = {}
+        self._subscribers: dict[str, Callable[[ZenohSample], object]] = {}
         self._servers: dict[str, Callable[[RclpyQuery], object]] = {}
-        self._watcher: Callable[[str, bool], None] | None = None
+        self._watchers: dict[str, Callable[[str, bool], None]] = {}
         # ROS 2's endpoints by their GID, and its nodes by name.
         self._foreign: dict[str, Ros2Endpoint] = {}
         self._gids: dict[bytes, tuple[bytes, str]] = {}
         self._nodes: dict[str, Ros2Node] = {}
         self._own_prefixes: set[str] = set()
-        self._calls: dict[bytes, tuple[str, asyncio.Future[list[ZenohReply]]]] = {}
+        self._calls: dict[bytes, asyncio.Future[list[ZenohSample]]] = {}
         self._call_numbers = itertools.count(1)
 
     async def start(self) -> None:
@@ -246,11 +286,10 @@ class RclpySession:
             await self._kill()
             raise self._no_rclpy(f"no answer within {_START_MAX:g} s") from None
         self.problem = ""
-        self._unmade.clear()
-        for number, endpoint in self._declared.items():
-            self._create(number, endpoint)
-            if number in self.kept:
-                self.write("M", number, self.kept[number])
+        for number, own in self.own.items():
+            self._create(number)
+            if own.kept is not None:
+                self.write("M", number, own.kept)
 
     def _no_rclpy(self, why: str) -> StartError:
         return StartError("ROS 2's half", f"{self._python}: {why}", code="no-rclpy")
@@ -285,15 +324,15 @@ class RclpySession:
 
     def _closed(self, _error: Exception | None) -> None:
         self._stream = None
-        if self._ready is not None and not self._ready.done():
+        if not self._ready.done():
             self._ready.set_exception(self._no_rclpy("it has ended at once"))
         for gid in list(self._foreign):
             self._remove(gid)
         for name in list(self._nodes):
-            self._remove_node(name)
-        for key, answer in self._calls.values():
+            self._tell(self._nodes.pop(name), alive=False)
+        for answer in self._calls.values():
             if not answer.done():
-                answer.set_result([ZenohReply(key, b"ROS 2's half has ended", b"", ok=False)])
+                answer.set_result([ZenohSample(b"ROS 2's half has ended", ok=False)])
         self._calls.clear()
         self._ended.set()
 
@@ -339,22 +378,24 @@ class RclpySession:
         if prefix := hello["prefix"]:
             self._own_prefixes.add(prefix)
             self.zid = prefix
-        if self._ready is not None and not self._ready.done():
+        if not self._ready.done():
             self._ready.set_result(None)
 
     def _failed(self, number: int, told: dict[str, Any]) -> None:
-        endpoint = self._declared.get(number)
-        if endpoint is None:
-            if self._ready is not None and not self._ready.done():
+        own = self.own.get(number)
+        if own is None:
+            if not self._ready.done():
                 self._ready.set_exception(self._no_rclpy(str(told.get("text"))))
             return
-        what = shown_in_ros2(endpoint)
+        endpoint, what = own.endpoint, shown_in_ros2(own.endpoint)
         if policy := told.get("policy"):
             self.say(what, f"its QoS does not fit {told['count']} endpoints of ROS 2: {policy}")
             return
-        self._unmade.add(number)
-        made = (self._declared[each] for each in self._alike(endpoint) if each not in self._unmade)
-        other = next((each.type for each in made if each.type != endpoint.type), "")
+        own.unmade = True
+        others = (
+            each.endpoint for each in self.own.values() if not each.unmade and each.endpoint.name == endpoint.name
+        )
+        other = next((each.type for each in others if each.type != endpoint.type), "")
         if other:
             text = (
                 f"{other} crosses, and {endpoint.type} does not: rclpy has one type of a topic at a time; rename one"
@@ -363,48 +404,44 @@ class RclpySession:
         else:
             self.say(what, f"ROS 2 does not have it: {told.get('text')}")
 
-    def _alike(self, endpoint: Ros2Endpoint) -> list[int]:
-        """What is declared under the name of an endpoint."""
-        return [number for number, each in self._declared.items() if each.name == endpoint.name]
-
-    def token(self, key: str) -> _Closer:
+    def token(self, key: str) -> ExitStack:
         """Have an endpoint made; a node is made with its first one."""
         endpoint = parse_token(key)
         if isinstance(endpoint, Ros2Node):
-            return _Closer(lambda: None)
-        number, gid = next(self._numbers), gid_of(key)
-        self._declared[number], self._keys[number] = endpoint, endpoint.key()
-        self._by_gid[gid] = number
-        self._create(number, endpoint)
+            return ExitStack()
+        number, gid = self._declare(endpoint), gid_of(key)
+        self.by_gid[gid] = number
 
         def end() -> None:
-            del self._declared[number], self._keys[number], self._by_gid[gid]
-            self.kept.pop(number, None)
+            del self.own[number], self.by_gid[gid]
             self.outbox.discard(number)
             self.say(shown_in_ros2(endpoint), "")
             self.write("-", number, b"")
-            self._unmade.discard(number)
-            for each in self._unmade.intersection(self._alike(endpoint)):  # the name may be free for its type now
-                self._unmade.discard(each)
-                self.say(shown_in_ros2(self._declared[each]), "")
-                self._create(each, self._declared[each])
+            for other, own in self.own.items():
+                if own.unmade and own.endpoint.name == endpoint.name:  # the name may be free for its type now
+                    self.say(shown_in_ros2(own.endpoint), "")
+                    self._create(other)
 
-        return _Closer(end)
+        return _closing(end)
 
-    def _create(self, number: int, endpoint: Ros2Endpoint) -> None:
+    def _declare(self, endpoint: Ros2Endpoint) -> int:
+        number = next(self._numbers)
+        self.own[number] = _Own(endpoint, endpoint.key())
+        self._create(number)
+        return number
+
+    def _create(self, number: int) -> None:
+        own = self.own[number]
+        own.unmade = False
         self._say(
             "+",
             number,
-            kind=endpoint.kind,
-            node=endpoint.node.name,
-            name=endpoint.name,
-            type=endpoint.type,
-            qos=qos_fields(endpoint.qos),
+            kind=own.endpoint.kind,
+            node=own.endpoint.node.name,
+            name=own.endpoint.name,
+            type=own.endpoint.type,
+            qos=qos_fields(own.endpoint.qos),
         )
-
-    def number_of(self, gid: bytes) -> int | None:
-        """The endpoint with this GID."""
-        return self._by_gid.get(gid)
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> RclpyPublisher:
         """A publisher for the declared endpoints of a key; ``on_matching`` tells whether ROS 2 subscribes."""
@@ -413,30 +450,16 @@ class RclpySession:
         asyncio.get_running_loop().call_soon(made.judge)
         return made
 
-    def subscribed(self, key: str) -> bool:
-        """Whether a node of ROS 2 subscribes to a topic with this type, whatever hash it has."""
-        return self._wanted[_without_hash(key)] > 0
-
-    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], None], *, history: bool = False) -> _Closer:
+    def subscribe(self, key: str, on_sample: Callable[[ZenohSample], object], *, history: bool = False) -> ExitStack:
         """Give what arrives for a key to a function; the subscription is declared by its token."""
         del history  # the token has its durability
-        self._subscribers.setdefault(key, []).append(on_sample)
+        self._subscribers[key] = on_sample
+        return _closing(lambda: self._subscribers.pop(key, None))
 
-        def end() -> None:
-            self._subscribers[key].remove(on_sample)
-            if not self._subscribers[key]:
-                del self._subscribers[key]
-
-        return _Closer(end)
-
-    def queryable(self, key: str, on_query: Callable[[RclpyQuery], object], _needs: Needs | None = None) -> _Closer:
+    def queryable(self, key: str, on_query: Callable[[RclpyQuery], object], _needs: Needs | None = None) -> ExitStack:
         """Give the calls of a service to a function; the server is declared by its token."""
         self._servers[key] = on_query
-
-        def end() -> None:
-            self._servers.pop(key, None)
-
-        return _Closer(end)
+        return _closing(lambda: self._servers.pop(key, None))
 
     async def get(
         self,
@@ -446,16 +469,15 @@ class RclpySession:
         *,
         timeout: float = 5.0,  # noqa: ASYNC109 - as a Zenoh session
         all_complete: bool = False,  # noqa: ARG002 - likewise
-        priority: ZenohPriority | None = None,  # noqa: ARG002 - likewise
-    ) -> list[ZenohReply]:
+    ) -> list[ZenohSample]:
         """Call a service; no answer within ``timeout`` seconds is an empty list."""
-        number = self.number_of(Ros2Attachment.parse(attachment).gid) or self._client(selector)
-        call = CALL.pack(next(self._call_numbers))
-        answer: asyncio.Future[list[ZenohReply]] = asyncio.get_running_loop().create_future()
-        self._calls[call] = selector, answer
+        number = self.by_gid.get(Ros2Attachment.parse(attachment).gid) or self._client(selector)
+        call = _CALL.pack(next(self._call_numbers))
+        answer: asyncio.Future[list[ZenohSample]] = asyncio.get_running_loop().create_future()
+        self._calls[call] = answer
         try:
             if self._stream is None:
-                return [ZenohReply(selector, self.problem.encode(), b"", ok=False)]
+                return [ZenohSample(self.problem.encode(), ok=False)]
             self.write("Q", number, call + bytes(payload))
             async with asyncio.timeout(timeout):
                 return await answer
@@ -469,58 +491,50 @@ class RclpySession:
         if key not in self._clients:
             domain, *name, type_name, type_hash = key.split("/")
             node = Ros2Node(int(domain), self.zid, 0, OWN_NAMESPACE + self._name)
-            number = self._clients[key] = next(self._numbers)
-            kind = EntityKind.CLIENT
-            made = Ros2Endpoint(node, number, kind, f"/{'/'.join(name)}", ros_type(type_name), type_hash, Ros2Qos())
-            self._declared[number] = made
-            self._create(number, made)
+            terms = EntityKind.CLIENT, f"/{'/'.join(name)}", ros_type(type_name), type_hash, Ros2Qos()
+            self._clients[key] = self._declare(Ros2Endpoint(node, 0, *terms))
         return self._clients[key]
 
     def _message(self, number: int, body: memoryview) -> None:
-        key = self._keys.get(number)
-        if key is None:
+        own = self.own.get(number)
+        if own is None:
             return
+        key = own.key
         at = 1 + body[0]
         real = bytes(body[1:at])
         stamp, sequence = _STAMPS.unpack_from(body, at)
         gid, of = self._gids.get(real, (real[:GID_BYTES].ljust(GID_BYTES, b"\0"), key))
         if of != key:
             return  # of a publisher with another definition of the type, which has a subscription of its own
-        sample = ZenohSample(key, bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
-        for take in tuple(self._subscribers.get(key, ())):
+        sample = ZenohSample(bytes(body[at + _STAMPS.size :]), Ros2Attachment(sequence, stamp, gid).serialize())
+        if (take := self._subscribers.get(key)) is not None:
             take(sample)
 
     def _query(self, number: int, body: bytes) -> None:
-        key = self._keys.get(number, "")
-        query = RclpyQuery(partial(self.write, "A", number), body[: CALL.size], key, body[CALL.size :])
+        key = own.key if (own := self.own.get(number)) is not None else ""
+        query = RclpyQuery(partial(self.write, "A", number), body[: _CALL.size], key, body[_CALL.size :])
         if (take := self._servers.get(key)) is not None:
             take(query)
         else:
             query.finish()
 
     def _answered(self, body: bytes) -> None:
-        key, answer = self._calls.get(body[: CALL.size], ("", None))
+        answer = self._calls.get(body[: _CALL.size])
         if answer is not None and not answer.done():
-            ok, payload = bool(body[CALL.size]), body[CALL.size + 1 :]
-            answer.set_result([ZenohReply(key, payload, b"", ok=ok)])
+            ok, payload = bool(body[_CALL.size]), body[_CALL.size + 1 :]
+            answer.set_result([ZenohSample(payload, ok=ok)])
 
-    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> _Closer:
+    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> ExitStack:
         """Call ``on_token(token, alive)`` for what ROS 2 has, and at each change."""
-        del key
-        self._watcher = on_token
-        for node in self._nodes.values():
-            on_token(node.token(), True)
-        for endpoint in self._foreign.values():
-            on_token(endpoint.token(), True)
-
-        def end() -> None:
-            self._watcher = None
-
-        return _Closer(end)
+        self._watchers[key] = on_token
+        entities: list[Ros2Node | Ros2Endpoint] = [*self._nodes.values(), *self._foreign.values()]
+        for entity in entities:
+            on_token(entity.token(), True)
+        return _closing(lambda: self._watchers.pop(key, None))
 
     def _tell(self, entity: Ros2Node | Ros2Endpoint, *, alive: bool) -> None:
-        if self._watcher is not None:
-            self._watcher(entity.token(), alive)
+        for on_token in tuple(self._watchers.values()):
+            on_token(entity.token(), alive)
 
     def _graph(self, change: dict[str, Any]) -> None:
         for gid in change["removed"]:
@@ -528,7 +542,7 @@ class RclpySession:
         gone = change["removed"] and self._clients.keys() - {each.key() for each in self._foreign.values()}
         for key in gone or ():
             client = self._clients.pop(key)
-            del self._declared[client]
+            del self.own[client]
             self.write("-", client, b"")
         rows = change["added"]
         prefixes = {row["node"]: row["gid"][:_PREFIX] for row in rows if row["kind"] != EntityKind.SERVICE}
@@ -536,7 +550,7 @@ class RclpySession:
         if own in prefixes:  # also of a half that was killed: its nodes stay in the graph for a while
             self._own_prefixes.add(prefixes[own])
         for name in [name for name in self._nodes if name not in change["nodes"]]:
-            self._remove_node(name)
+            self._tell(self._nodes.pop(name), alive=False)
         for name in change["nodes"]:
             prefix = prefixes.get(name, "")
             if name not in self._nodes and (not name.startswith(OWN_NAMESPACE) or prefix):
@@ -560,7 +574,7 @@ class RclpySession:
         kind = EntityKind(row["kind"])
         made = Ros2Endpoint(node, next(self._numbers), kind, row["name"], type_name, type_hash, qos)
         self._foreign[row["gid"]] = made
-        self._wanted[_without_hash(made.key())] += kind is EntityKind.SUBSCRIPTION
+        self.wanted[_without_hash(made.key())] += kind is EntityKind.SUBSCRIPTION
         if kind is not EntityKind.SERVICE:
             self._gids[bytes.fromhex(row["gid"])] = gid_of(made.token()), made.key()
         self._tell(made, alive=True)
@@ -568,13 +582,10 @@ class RclpySession:
     def _remove(self, gid: str) -> None:
         endpoint = self._foreign.pop(gid, None)
         if endpoint is not None:
-            self._wanted[_without_hash(endpoint.key())] -= endpoint.kind is EntityKind.SUBSCRIPTION
+            self.wanted[_without_hash(endpoint.key())] -= endpoint.kind is EntityKind.SUBSCRIPTION
             if endpoint.kind is not EntityKind.SERVICE:
                 self._gids.pop(bytes.fromhex(gid), None)
             self._tell(endpoint, alive=False)
-
-    def _remove_node(self, name: str) -> None:
-        self._tell(self._nodes.pop(name), alive=False)
 
     @property
     def endpoints(self) -> tuple[str, ...]:

@@ -19,9 +19,9 @@ from rmpa.core.errors import StartError, UnreachableError
 from rmpa.core.identity import is_own
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.actions import Ros2Actions
-from rmpa.gateway.ros2.format import Ros2Endpoint, graph_key
+from rmpa.gateway.ros2.format import EntityKind, Ros2Node, graph_key
 from rmpa.gateway.ros2.graph import SITE
-from rmpa.gateway.ros2.parameters import Ros2Parameters
+from rmpa.gateway.ros2.pairs import PART
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
 from rmpa.gateway.ros2.topics import Ros2Topics
@@ -31,22 +31,19 @@ from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
+from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-    from typing import TypeAlias
 
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.ros2.link import Declared, Ros2Link
-    from rmpa.gateway.ros2.topics import Ros2Dialect, Ros2Import, Ros2Publisher
+    from rmpa.gateway.ros2.graph import Declared, Ros2Link
+    from rmpa.gateway.ros2.topics import Ros2Export, Ros2Import, Ros2Publisher
     from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.topics import ExportedTopic
     from rmpa.observe.sites import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
-
-    _Part: TypeAlias = Ros2Actions | Ros2Services | Ros2Topics
 
 _log: Final = logging.getLogger(__name__)
 _RULES: Final = "change [[gateway.rule]] in the rmpa.toml of the gateway, and reload it"
@@ -79,14 +76,13 @@ class Ros2Neighbour:
         session: Ros2Link,
         settings: GatewaySettings,
         contracts: Contracts | None = None,
-        find: Callable[[str], MessageType] | None = None,
+        find: Callable[[str], MessageType] = find_message_type,
     ) -> None:
-        context = self.context = Ros2Context(graph, session, settings, contracts or Contracts())
-        self.topics = Ros2Topics(context) if find is None else Ros2Topics(context, find)
+        context = self.context = Ros2Context(graph, session, settings, contracts or Contracts(), find)
+        self.topics = Ros2Topics(context)
         self.services = Ros2Services(context)
-        self.parameters = Ros2Parameters(context)
-        # Actions take all topics and services of actions, so that no other part carries them.
-        self._parts: tuple[_Part, ...] = (Ros2Actions(context), self.services, self.topics)
+        # It takes all topics and services of actions, so that no other part carries them.
+        self._actions = Ros2Actions(context)
         # By proxy.
         self._sources: dict[str, set[MeshSource]] = {}
         # The proxies that another gateway shows in ROS 2, with its session.
@@ -106,8 +102,9 @@ class Ros2Neighbour:
         self._closed = True
         if self._watch is not None:
             self._watch.close()
-        for part in self._parts:
-            part.close()
+        self._actions.close()
+        self.services.close()
+        self.topics.close()
         await self.context.close()
 
     def report(self) -> dict[str, object]:
@@ -122,12 +119,17 @@ class Ros2Neighbour:
     def _token(self, key: str, alive: bool) -> None:
         if self._closed:
             return
-        if rival := self.context.ros2.rival(key, alive=alive):
-            self._judge(rival)
         entity = self.context.ros2.change(key, alive=alive)
-        if isinstance(entity, Ros2Endpoint):
+        if isinstance(entity, Ros2Node):
+            self._judge(entity.name)  # of another gateway, if it is of a module
+        elif entity is not None:
             _log.debug("%s %s", "+" if alive else "-", entity.token())
-            any(part.endpoint(entity, there=alive) for part in self._parts)
+            if PART in entity.name:
+                self._actions.endpoint(entity, there=alive)
+            elif entity.kind is EntityKind.SERVICE:
+                self.services.endpoint(entity, there=alive)
+            elif entity.kind is not EntityKind.CLIENT:
+                self.topics.endpoint(entity, there=alive)
             if alive:
                 self.context.asker.appeared()
 
@@ -156,7 +158,12 @@ class Ros2Neighbour:
                 self._offer(source, there=stands_by)
 
     def _offer(self, source: MeshSource, *, there: bool) -> None:
-        any(part.mesh_source(source, there=there) for part in self._parts)
+        if self._actions.takes(source):
+            self._actions.mesh_source(source, there=there)
+        elif source.kind is SourceKind.SERVICE:
+            self.services.mesh_source(source, there=there)
+        else:
+            self.topics.mesh_source(source, there=there)
 
     def ways(self, name: str, site: str = "", module: str = "") -> list[Diagnosis]:
         """The ways of a topic between ROS 2 and the modules.
@@ -179,10 +186,10 @@ class Ros2Neighbour:
                 for each in imported.publishers.values():
                     stages = until_failure(_in_stages(imported, each))
                     ways.append(_way(stages, imported.decision.name, each.node, SITE, gateway))
-        for export, dialect in self.topics.exports() if not site else ():
+        for export in self.topics.exports() if not site else ():
             source = export.source
             if source.here == name:
-                stages = until_failure(_out_stages(export, dialect, self.context.problems))
+                stages = until_failure(_out_stages(export, self.context.problems))
                 ways.append(_way(stages, name, source.node, source.module, SITE))
         for what, why in self.topics.refused.items():
             topic, _, node = what.partition(" of ")
@@ -201,7 +208,7 @@ class Ros2Neighbour:
             return [*ways, *(await self.sites.answer(what, args, asker) if self.sites is not None else ())]
         if what == PARAM and site == SITE:
             denial = partial(self.permissions.denial, asker, access=Access.CALL)
-            return await self.parameters.answer(args, denial if asker else lambda _: "")
+            return await self.context.asker.parameters(args, denial if asker else lambda _: "")
         if what == REPORT or (what == SITE_INFO and site == SITE):
             report = await self._report(asker)
             if what == SITE_INFO:
@@ -233,46 +240,39 @@ class Ros2Neighbour:
 
     def _rows(self, asker: str) -> Iterator[SiteSourceInfo]:
         """What ROS 2 has, with what is wrong with it; then problems of what the modules have."""
-        topic, service = SourceKind.TOPIC, SourceKind.SERVICE
-        rows: list[tuple[SourceKind, str, str, str, str, str]] = []
-        for each in self.topics.imports.values():
-            for one in each.publishers.values():
-                problem = each.problem or one.topic.problem
-                rows.append((topic, each.first.name, one.node, each.ros1_type, each.decision.name, problem))
-        for name, shown in self.services.shown.items():
-            rows.append((service, name, "", shown.server.type, name, ""))
+        rows: list[tuple[SourceKind, str, str, str, str, str]] = [
+            (SourceKind.TOPIC, each.first.name, one.node, each.ros1_type, each.decision.name, each.problem_of(one))
+            for each in self.topics.imports.values()
+            for one in each.publishers.values()
+        ]
+        rows += [
+            (SourceKind.SERVICE, name, "", one.server.type, name, "") for name, one in self.services.shown.items()
+        ]
         for what, problem in self.context.problems.items():
             name, _, node = what.partition(" of ")
-            rows.append((topic, name, node, "*", "", problem))
+            rows.append((SourceKind.TOPIC, name, node, "*", "", problem))
         for kind, name, node, type_name, here, problem in rows:
             if self.permissions.tells(asker, kind, here or name):
-                yield SiteSourceInfo(
-                    kind=kind.name.lower(),
-                    module="",
-                    node=node,
-                    name=name,
-                    type=type_name,
-                    here=here,
-                    problem=problem,
-                )
+                row = {"node": node, "name": name, "type": type_name, "here": here, "problem": problem}
+                yield SiteSourceInfo(kind=kind.name.lower(), module="", **row)
 
 
 def _way(stages: tuple[Check, ...], name: str, node: str, peer: str, to: str) -> Diagnosis:
     return Diagnosis.of(stages, name=name, peer=peer, to=to, node=node)
 
 
-def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[str, str]) -> Iterator[Check]:
-    yield Check("rule", OK, dialect.why)
+def _out_stages(export: Ros2Export, problems: Mapping[str, str]) -> Iterator[Check]:
+    yield Check("rule", OK, export.why)
     if problem := export.problem or (
-        problems.get(shown_in_ros2(dialect.endpoint.endpoint)) if dialect.endpoint is not None else ""
+        problems.get(shown_in_ros2(export.endpoint.endpoint)) if export.endpoint is not None else ""
     ):
         yield Check("type", FAIL, problem)
-    if dialect.endpoint is None:
+    if export.endpoint is None:
         text = f"ROS 2 has no {export.source.type}; its publisher is being asked for the definition"
         yield Check("type", WARN, text)
         return
-    kept = ", transient local" if dialect.latched else ""
-    yield Check("type", OK, f"it is {dialect.endpoint.endpoint.type} in ROS 2{kept}")
+    kept = ", transient local" if export.latched else ""
+    yield Check("type", OK, f"it is {export.endpoint.endpoint.type} in ROS 2{kept}")
     ends = ((what.partition(" of "), text) for what, text in problems.items())
     deaf = [
         f"{node}: {text}"
@@ -289,7 +289,7 @@ def _out_stages(export: ExportedTopic, dialect: Ros2Dialect, problems: Mapping[s
     losses = (
         (export.dropped, _DROPPED),
         (export.limited, _LIMITED),
-        (dialect.unconverted, _UNCONVERTED),
+        (export.unconverted, _UNCONVERTED),
     )
     yield flow("sent", f"{export.messages} messages were sent{waiting}", export.messages, losses)
 
@@ -299,7 +299,7 @@ def _in_stages(imported: Ros2Import, publisher: Ros2Publisher) -> Iterator[Check
     yield Check("rule", OK, imported.decision.why)
     own = imported.declared
     in_ros2 = imported.part.context.problems.get(shown_in_ros2(own), "") if own is not None else ""
-    if problem := imported.problem or publisher.topic.problem or in_ros2:
+    if problem := imported.problem_of(publisher) or in_ros2:
         yield Check("type", FAIL, problem)
     kept = ", transient local" if publisher.latched else ""
     yield Check("type", OK, f"{there.type} of ROS 2 is {imported.ros1_type} here{kept}")

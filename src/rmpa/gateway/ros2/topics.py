@@ -23,21 +23,18 @@ from rmpa.gateway.ros2.format import (
     zenoh_qos,
 )
 from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
-from rmpa.gateway.ros2.pairs import Ros2Pairs
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.topics import ExportedTopic, TopicLimits
 from rmpa.gateway.zenoh.threads import BoundedQueue
-from rmpa.ros.types.find import find_message_type, type_of_header
+from rmpa.ros.types.find import type_of_header
 from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.loop import Delay
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint
-    from rmpa.gateway.ros2.link import Declared
     from rmpa.gateway.ros2.services import Ros2Context
     from rmpa.gateway.rules import CrossingDecision, MeshSource
     from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
@@ -78,15 +75,15 @@ _TOPIC_ENDS: Final = (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
 _SEQ: Final = struct.Struct("<I")
 
 
-class Ros2Dialect:
-    """The dialect of an ``ExportedTopic`` to ROS 2: messages are converted, and a token has the type's hash.
+class Ros2Export(ExportedTopic):
+    """A topic in ROS 2: messages are converted, and a token has the type's hash.
 
     A type that ROS 2's distribution does not have is learnt first from the publisher's header: its hash is part of
     the key. A latched topic becomes transient local, and stays connected once it was wanted, so that what is kept for
     late subscribers is the last message.
 
     Args:
-        part: Tells it the types, and compares it with what ROS 2 has.
+        part: Compares it with what ROS 2 has.
         source: The topic.
         decision: The rule that lets it cross.
 
@@ -95,7 +92,9 @@ class Ros2Dialect:
     """
 
     def __init__(self, part: Ros2Topics, source: MeshSource, decision: CrossingDecision) -> None:
-        self.source: Final = source
+        context = part.context
+        super().__init__(source, context.graph, context.session, decision.rate, decision.size)
+        self.payload, self.attachment = self._converted, self._attached
         self.why: Final = decision.why
         self.endpoint: OwnEndpoint | None = None
         self.unconverted = 0
@@ -111,14 +110,14 @@ class Ros2Dialect:
         return self.endpoint is not None and self.endpoint.endpoint.qos.latched
 
     def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos] | None:
-        """Of ``ExportDialect``: once latched it stays so, and no message yields for its size."""
+        """Of ``ExportedTopic``: once latched it stays so, and no message yields for its size."""
         del large
         context, source = self._part.context, self.source
         try:
-            found = self._part.pairs.ros2_type(source.type) if about is None else self._learn(about)
+            found = context.pairs.ros2_type(source.type) if about is None else self._learn(about)
         except RmpaError:
             self._conversion = None
-            self.close()
+            self._undeclare()
             raise
         if found is None:
             return None
@@ -127,15 +126,31 @@ class Ros2Dialect:
         qos = ros2_qos(context.contracts, source.name, source.type, latching=self._latching, depth=depth)
         old = self.endpoint
         if old is None or (old.endpoint.type, old.endpoint.type_hash, old.endpoint.qos) != (*found, qos):
-            self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, *found, qos)
+            self.endpoint = context.nodes.declare(source.proxy, EntityKind.PUBLISHER, source.here, found, qos)
             if old is not None:
                 old.close()
             self._part.declared(self)
         assert self.endpoint is not None  # noqa: S101 - it is declared here, or was before
         return self.endpoint.endpoint.key(), zenoh_qos(context.contracts.of(source.name, source.type), qos)
 
-    def payload(self, body: memoryview) -> bytes | None:
-        """Of ``ExportDialect``."""
+    def linger(self, *, keeps: bool) -> float | None:
+        """Of ``ExportedTopic``."""
+        return None if keeps else 0.0
+
+    def say(self, problem: str) -> None:
+        """Of ``ExportedTopic``; the log tells it too."""
+        super().say(problem)
+        self._log(problem)
+
+    def close(self) -> None:
+        """Take everything back."""
+        super().close()
+        self._undeclare()
+
+    def _log(self, problem: str) -> None:
+        self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
+
+    def _converted(self, body: memoryview) -> bytes | None:
         if self._conversion is None:
             return None
         try:
@@ -143,32 +158,22 @@ class Ros2Dialect:
         except ConversionError as error:
             self.unconverted += 1
             if self.unconverted == 1:
-                self.say(str(error))
+                self._log(str(error))
             return None
 
-    def attachment(self, sequence: int, stamp: int) -> bytes:
-        """Of ``ExportDialect``."""
+    def _attached(self, sequence: int, stamp: int) -> bytes:
         return Ros2Attachment(sequence, stamp, self.endpoint.gid if self.endpoint is not None else b"").serialize()
 
-    def linger(self, *, keeps: bool) -> float | None:
-        """Of ``ExportDialect``."""
-        return None if keeps else 0.0
-
-    def say(self, problem: str) -> None:
-        """Of ``ExportDialect``."""
-        self._part.context.say(f"{self.source.here} of {self.source.proxy}", problem)
-
-    def close(self) -> None:
-        """Of ``ExportDialect``."""
+    def _undeclare(self) -> None:
         if self.endpoint is not None:
             self.endpoint.close()
             self.endpoint = None
 
     def _learn(self, about: TopicDescription) -> tuple[str, str]:
         fields = {"type": about.type, "md5sum": about.md5sum, "message_definition": about.definition}
-        kind = type_of_header(fields)
-        found = self._part.pairs.learn(kind)
-        self._conversion = self._part.pairs.outgoing(kind)
+        kind, pairs = type_of_header(fields), self._part.context.pairs
+        found = pairs.learn(kind)
+        self._conversion = pairs.outgoing(kind)
         return found
 
 
@@ -228,24 +233,29 @@ class Ros2Import:
         self._by_gid: dict[bytes, Ros2Publisher] = {}
         self._adopted: dict[bytes, Ros2Publisher] = {}
         self._has_seq = False
-        self._subscribed: tuple[Declared, OwnEndpoint] | None = None
+        # The gateway's subscription in ROS 2.
+        self._subscription: OwnEndpoint | None = None
         self._history = False
         self._qos = Ros2Qos()
         self.sequences = Ros2Sequences()
         self.early: BoundedQueue[tuple[bytes, int, bytes]] = BoundedQueue(_ROS2_EARLY_MESSAGES, _ROS2_EARLY_BYTES)
         self.unconverted = self.limited = 0
         self._limits = TopicLimits.of(decision.rate, decision.size)
-        self._lingering: asyncio.TimerHandle | None = None
+        self._lingering = Delay()
 
     @property
     def declared(self) -> Ros2Endpoint | None:
         """The gateway's subscription in ROS 2; ``None``: there is none."""
-        return self._subscribed[1].endpoint if self._subscribed is not None else None
+        return self._subscription.endpoint if self._subscription is not None else None
 
     @property
     def idle(self) -> bool:
         """Whether it has no publishers, and none came or went a moment ago: its publisher does not restart."""
-        return not self.publishers and self._lingering is None
+        return not self.publishers and not self._lingering
+
+    def problem_of(self, publisher: Ros2Publisher) -> str:
+        """Why messages of one of its publishers do not come, or are not understood; empty for nothing."""
+        return self.problem or publisher.topic.problem
 
     def add(self, endpoint: Ros2Endpoint) -> None:
         """A publisher appeared."""
@@ -284,8 +294,7 @@ class Ros2Import:
 
     def close(self) -> None:
         """Take it out of the gateway's graph."""
-        if self._lingering is not None:
-            self._lingering.cancel()
+        self._lingering.cancel()
         for publisher in self.publishers.values():
             publisher.topic.close()
         self._unsubscribe()
@@ -317,31 +326,24 @@ class Ros2Import:
 
     def _linger(self) -> None:
         """Stay subscribed for a moment, and hold what comes: nodes subscribe to a new source some time after it."""
-        if self._subscribed is None:
-            return
-        if self._lingering is not None:
-            self._lingering.cancel()
-        self._lingering = asyncio.get_running_loop().call_later(_ROS2_LINGER, self._end_lingering)
+        if self._subscription is not None:
+            self._lingering.set(_ROS2_LINGER, self._end_lingering)
 
     def _end_lingering(self) -> None:
-        self._lingering = None
         self.early.clear()
         self._follow_demand()
         self.part.drop_idle(self)
 
     def _follow_demand(self) -> None:
         wanted = self.conversion is not None and any(each.wanted for each in self.publishers.values())
-        if not wanted and self._lingering is None:
+        if not wanted and not self._lingering:
             self._unsubscribe()
-        elif wanted and self._subscribed is None:
-            context, first = self.part.context, self.first
+        elif wanted and self._subscription is None:
+            nodes, first = self.part.context.nodes, self.first
             self._history = any(each.latched for each in self.publishers.values())
-            qos, kind = self._terms(), EntityKind.SUBSCRIPTION
-            self._qos = qos
-            self._subscribed = (
-                context.session.subscribe(first.key(), self._sample, history=self._history),
-                context.nodes.declare(context.nodes.own_name, kind, first.name, first.type, first.type_hash, qos),
-            )
+            self._qos = self._terms()
+            terms = EntityKind.SUBSCRIPTION, first.name, (first.type, first.type_hash), self._qos
+            self._subscription = nodes.declare(nodes.own_name, *terms, take=self._sample, history=self._history)
 
     def _terms(self) -> Ros2Qos:
         """The QoS that fits all publishers: DDS connects no subscription that asks for more than one offers."""
@@ -355,9 +357,9 @@ class Ros2Import:
         )
 
     def _unsubscribe(self) -> None:
-        for each in self._subscribed or ():
-            each.close()
-        self._subscribed = None
+        if self._subscription is not None:
+            self._subscription.close()
+            self._subscription = None
         self.sequences.forget()
         self._adopted.clear()
         for publisher in self.publishers.values():
@@ -380,7 +382,7 @@ class Ros2Import:
             self._deliver(publisher, sample.payload, sequence)
         elif publisher is not None and publisher.latched:
             publisher.kept = sample.payload
-        elif self._lingering is not None:
+        elif self._lingering:
             self.early.push((gid, sequence, sample.payload), len(sample.payload))
 
     def _publisher_of(self, gid: bytes) -> Ros2Publisher | None:
@@ -430,31 +432,29 @@ class Ros2Topics:
 
     Args:
         context: What the parts share.
-        find: Finds a ROS 1 type on this machine by its name; raises ``RmpaError`` if there is none.
 
     Attributes:
         refused: Why topics do not cross, by ``<topic> of <node>``.
         imports: ROS 2's topics in the gateway's graph, by key.
     """
 
-    def __init__(self, context: Ros2Context, find: Callable[[str], MessageType] = find_message_type) -> None:
+    def __init__(self, context: Ros2Context) -> None:
         self.context: Final = context
-        self.pairs: Final = Ros2Pairs(context.types, context.mapping, find)
         self.refused: dict[str, str] = {}
         # By name here, then by proxy.
-        self._exports: dict[str, dict[str, tuple[ExportedTopic, Ros2Dialect]]] = {}
+        self._exports: dict[str, dict[str, Ros2Export]] = {}
         self.imports: dict[str, Ros2Import] = {}
         self._looks = asyncio.Semaphore(_LATCH_LOOKS_AT_ONCE)
 
     def close(self) -> None:
         """Take back all topics of both sides."""
-        for export, _ in self.exports():
+        for export in self.exports():
             export.close()
         for imported in self.imports.values():
             imported.close()
 
-    def exports(self) -> list[tuple[ExportedTopic, Ros2Dialect]]:
-        """The topics of modules in ROS 2's graph, each with its dialect."""
+    def exports(self) -> list[Ros2Export]:
+        """The topics of modules in ROS 2's graph."""
         return [each for exports in self._exports.values() for each in exports.values()]
 
     def _refuse(self, what: str, why: str) -> None:
@@ -462,13 +462,11 @@ class Ros2Topics:
             del self.refused[next(iter(self.refused))]
         self.refused[what] = why
 
-    def mesh_source(self, source: MeshSource, *, there: bool) -> bool:
+    def mesh_source(self, source: MeshSource, *, there: bool) -> None:
         """Put a topic of a module into ROS 2's graph, or take it out."""
-        if source.kind is not SourceKind.TOPIC:
-            return False
         exports = self._exports.setdefault(source.here, {})
         if (old := exports.pop(source.proxy, None)) is not None:
-            old[0].close()
+            old.close()
         what = f"{source.here} of {source.proxy}"
         self.refused.pop(what, None)
         decision = self.context.rules.outgoing_to(SITE, source.module, source.name)
@@ -477,19 +475,14 @@ class Ros2Topics:
         elif there and not decision.allowed:
             self._refuse(what, decision.why)
         elif there:
-            dialect = Ros2Dialect(self, source, decision)
-            export = ExportedTopic(
-                source, self.context.graph, self.context.session, dialect, decision.rate, decision.size
-            )
-            exports[source.proxy] = export, dialect
+            export = exports[source.proxy] = Ros2Export(self, source, decision)
             export.start()
-            if export.announced and not dialect.latched and source.type not in _STREAMS:
+            if export.announced and not export.latched and source.type not in _STREAMS:
                 self.context.start(self._look(export), f"look at {source.here}")
         if not exports:
             del self._exports[source.here]
-        return True
 
-    async def _look(self, export: ExportedTopic) -> None:
+    async def _look(self, export: Ros2Export) -> None:
         """Ask the publisher once for its header, which tells whether it latches, unless it was asked before."""
         await asyncio.sleep(limits.LATCH_LOOK_AFTER)
         async with self._looks:
@@ -497,35 +490,33 @@ class Ros2Topics:
                 with contextlib.suppress(RmpaError):
                     await export.header(_LATCH_LOOK_TIMEOUT)
 
-    def declared(self, dialect: Ros2Dialect) -> None:
+    def declared(self, export: Ros2Export) -> None:
         """A topic has another type or hash now: compare it with what ROS 2 has under its name."""
-        for other in list(self.context.ros2.at(dialect.source.here, *_TOPIC_ENDS)):
-            self._compare(dialect, other)
+        for other in list(self.context.ros2.at(export.source.here, *_TOPIC_ENDS)):
+            self._compare(export, other)
         for imported in self.imports.values():  # a type was learnt: topics whose fields were not known may have it
             if imported.conversion is None:
                 with contextlib.suppress(NoConversion):
-                    found = self.pairs.incoming(imported.first.type, imported.first.type_hash)
+                    found = self.context.pairs.incoming(imported.first.type, imported.first.type_hash)
                     if found is not None:
                         imported.converted(found)
 
-    def _compare(self, dialect: Ros2Dialect, other: Ros2Endpoint) -> None:
-        if dialect.endpoint is not None:
-            text = mismatch(dialect.endpoint.endpoint, other, self.context.types.distribution)
+    def _compare(self, export: Ros2Export, other: Ros2Endpoint) -> None:
+        if export.endpoint is not None:
+            text = mismatch(export.endpoint.endpoint, other, self.context.types.distribution)
             if text:
                 self.context.say(f"{other.name} of {other.node.name}", text)
 
-    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> bool:
+    def endpoint(self, endpoint: Ros2Endpoint, *, there: bool) -> None:
         """Show a publisher of ROS 2 in the gateway's graph, or take it out; compare it with what is here."""
-        if endpoint.kind not in _TOPIC_ENDS:
-            return False
         what = f"{endpoint.name} of {endpoint.node.name}"
         if there:
-            for _, dialect in self._exports.get(endpoint.name, {}).values():
-                self._compare(dialect, endpoint)
+            for export in self._exports.get(endpoint.name, {}).values():
+                self._compare(export, endpoint)
         else:
             self.context.say(what, "")
         if endpoint.kind is not EntityKind.PUBLISHER or "/_" in endpoint.name:
-            return True  # ROS 2's tools hide what has such a name, as the topics of actions
+            return  # ROS 2's tools hide what has such a name, as the topics of actions
         imported = self.imports.get(endpoint.key())
         if there:
             self._add(endpoint, imported, what)
@@ -534,7 +525,6 @@ class Ros2Topics:
             if imported is not None:
                 imported.remove(endpoint)
                 self.drop_idle(imported)
-        return True
 
     def drop_idle(self, imported: Ros2Import) -> None:
         """A topic without publishers goes; one that was wanted stays for a while, as its publisher may restart."""
@@ -543,7 +533,7 @@ class Ros2Topics:
 
     def _add(self, endpoint: Ros2Endpoint, imported: Ros2Import | None, what: str) -> None:
         if imported is None:
-            kind = self.pairs.ros1_name(endpoint.type)
+            kind = self.context.pairs.ros1_name(endpoint.type)
             source = ForeignSource(SourceKind.TOPIC, SITE, "", endpoint.node.name, endpoint.name, kind)
             decision = self.context.rules.incoming(source)
             if not decision.allowed:
@@ -556,7 +546,7 @@ class Ros2Topics:
             if not imported.problem:
                 return  # else this node may be able to describe the type
         try:
-            conversion = self.pairs.incoming(endpoint.type, endpoint.type_hash)
+            conversion = self.context.pairs.incoming(endpoint.type, endpoint.type_hash)
         except NoConversion as error:
             imported.converted(None, str(error))
             return
@@ -569,11 +559,11 @@ class Ros2Topics:
         """Ask the publisher's node for the fields of its type."""
         name, type_hash = endpoint.type, endpoint.type_hash
         try:
-            self.pairs.described(name, type_hash, await self.context.asker.learn(of=endpoint))
-            imported.converted(self.pairs.incoming(name, type_hash))
+            self.context.pairs.described(name, type_hash, await self.context.asker.learn(of=endpoint))
+            imported.converted(self.context.pairs.incoming(name, type_hash))
         except (NoConversion, RemoteProtocolError) as error:
             if imported.conversion is None:
                 imported.converted(None, str(error))
             return
-        for export, _ in self.exports():
+        for export in self.exports():
             export.start()

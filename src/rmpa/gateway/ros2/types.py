@@ -1,23 +1,20 @@
-"""Types of ROS 2: fields, hashes, descriptions and sizes; and the sequence numbers of a topic's publishers."""
+"""Types of ROS 2: fields, hashes and sizes; and the sequence numbers of a topic's publishers."""
 
 from __future__ import annotations
 
-import functools
 import re
-import struct
 from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rmpa.core.errors import ConfigError, RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import NO_HASH
-from rmpa.ros.limits import DEFINITION_DEPTH_MAX, DEFINITION_FIELDS_MAX
+from rmpa.ros.limits import DEFINITION_DEPTH_MAX
 from rmpa.ros.types.definitions import Field
 
 if TYPE_CHECKING:
@@ -26,7 +23,6 @@ if TYPE_CHECKING:
     from rmpa.gateway.ros2.format import Ros2Attachment
     from rmpa.ros.types.definitions import Specification
     from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.wire.tcpros import Buffer
 
 
 # A field of ROS 1 to one of ROS 2, each a path with dots.
@@ -56,13 +52,11 @@ class Ros2Sequences:
 
     Attributes:
         lost: Messages that publishers sent and that did not come.
-        repeated: Messages that came again.
     """
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
         self.lost = 0
-        self.repeated = 0
 
     def accept(self, attachment: Ros2Attachment, *, history: bool) -> bool:
         """Take in a message.
@@ -79,7 +73,6 @@ class Ros2Sequences:
             del self._last[next(iter(self._last))]
         if last is not None and history and 0 < attachment.sequence <= last:
             self._last[attachment.gid] = last
-            self.repeated += 1
             return False
         self._last[attachment.gid] = attachment.sequence
         if last is not None and attachment.sequence > last + 1:
@@ -328,117 +321,3 @@ def check_size(name: str, fields_of: Callable[[str], Iterable[Field]]) -> None:
         raise RemoteProtocolError(f"{name} has more than {limits.ROS2_PARTS_MAX} fields with those of its types")
     if elements > limits.ROS2_ARRAY_MAX:
         raise RemoteProtocolError(f"{name} has arrays of more than {limits.ROS2_ARRAY_MAX} elements")
-
-
-# The service ``~/get_type_description`` of ROS 2 nodes (REP 2016). Its request, and the fields in its response.
-#
-# A response is checked before it is used: rosbags makes Python code of the names in it.
-
-
-# The last part of the service's name; the others are its node's.
-SERVICE: Final = "get_type_description"
-SERVICE_TYPE: Final = "type_description_interfaces/srv/GetTypeDescription"
-_REQUEST: Final = f"{SERVICE_TYPE}_Request"
-_RESPONSE: Final = f"{SERVICE_TYPE}_Response"
-_PARTS: Final = {
-    "rcl_interfaces/srv/ListParameters_Request": "string[] prefixes; uint64 depth",
-    "rcl_interfaces/srv/ListParameters_Response": "rcl_interfaces/ListParametersResult result",
-    "rcl_interfaces/srv/GetParameters_Request": "string[] names",
-    "rcl_interfaces/srv/GetParameters_Response": "rcl_interfaces/ParameterValue[] values",
-    "rcl_interfaces/srv/SetParametersAtomically_Request": "rcl_interfaces/Parameter[] parameters",
-    "rcl_interfaces/srv/SetParametersAtomically_Response": "rcl_interfaces/SetParametersResult result",
-    _REQUEST: "string type_name; string type_hash; bool include_type_sources",
-    _RESPONSE: (
-        "bool successful; string failure_reason; type_description_interfaces/TypeDescription type_description;"
-        "type_description_interfaces/TypeSource[] sources; type_description_interfaces/KeyValue[] extra_information"
-    ),
-}
-_NUMBERS: Final = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
-# type_description_interfaces/msg/FieldType, without those that ROS 1 lacks. ``char`` of C++ (13) is one octet.
-_BASES: Final = dict(enumerate(_NUMBERS, 2)) | {13: "uint8", 15: "bool", 16: "byte", 17: "string", 21: "string"}
-_NESTED: Final = 1
-_BOUNDED_STRING: Final = 21
-_TYPE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
-_FIELD_NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
-# What is added to a type's number for an array of fixed size, a bounded and an unbounded sequence of it.
-_ARRAY, _BOUNDED, _UNBOUNDED = 48, 96, 144
-
-
-@functools.cache
-def service_types() -> Ros2Types:
-    """The types with requests and responses of the services that each node of ROS 2 has and the gateway calls."""
-    types = Ros2Types("jazzy")
-    for name, text in _PARTS.items():
-        [fields] = get_types_from_msg(text.replace(";", "\n"), name).values()
-        types.take({name: fields})
-    return types
-
-
-def type_request(name: str, type_hash: str) -> bytes:
-    """The CDR of a request for the description of ``package/msg/Name`` with a hash."""
-    message = service_types().store.types[_REQUEST](type_name=name, type_hash=type_hash, include_type_sources=False)
-    return bytes(service_types().store.serialize_cdr(message, _REQUEST))
-
-
-def parse_type_response(raw: Buffer) -> dict[str, Any]:
-    """Read a response: the fields of the type and of all that it embeds, in rosbags' form, without constants.
-
-    Raises:
-        RemoteProtocolError: It is malformed, too large, or has a field that neither side's ROS has; or the node does
-            not know the type, and the text says why.
-    """
-    if len(raw) > limits.ROS2_DESCRIPTION_MAX:
-        raise RemoteProtocolError(f"a type's description has {len(raw)} bytes; at most {limits.ROS2_DESCRIPTION_MAX}")
-    store = service_types().store
-    kind = store.get_msgdef(_RESPONSE)
-    try:  # not by the store, which takes no garbage behind a message: rmw_fastrtps pads more than it does
-        read = kind.deserialize_cdr_le if raw[1] else kind.deserialize_cdr_be
-        message: Any = read(bytes(raw[4:]), 0, kind.cls, store)[0]
-    except (SerdeError, ValueError, IndexError, AssertionError, OverflowError, struct.error) as error:
-        raise RemoteProtocolError(f"a type's description is malformed: {error}") from error
-    if not message.successful:
-        raise RemoteProtocolError(f"the node does not describe the type: {message.failure_reason[:200]}")
-    described = message.type_description
-    all_types = (described.type_description, *described.referenced_type_descriptions)
-    if len(all_types) > limits.ROS2_DESCRIBED_TYPES_MAX:
-        raise RemoteProtocolError(f"a type's description has {len(all_types)} types")
-    made: dict[str, Any] = {_checked(each.type_name, _TYPE_NAME): ([], _fields(each)) for each in all_types}
-    for name in made:
-        check_size(name, lambda each: ros2_fields(made[each][1]) if each in made else ())
-    return made
-
-
-def _checked(name: str, form: re.Pattern[str]) -> str:
-    if len(name) > limits.ROS2_NAME_MAX or form.fullmatch(name) is None:
-        raise RemoteProtocolError(f"{name[:80]!r} is not the name of a type or field of ROS 2")
-    return name
-
-
-def _fields(described: Any) -> Fields:
-    if not described.fields:  # ROS 2's have one at least; elements without bytes may be claimed without end
-        raise RemoteProtocolError(f"{described.type_name[:80]} has no fields")
-    if len(described.fields) > DEFINITION_FIELDS_MAX:
-        raise RemoteProtocolError(f"{described.type_name[:80]} has {len(described.fields)} fields")
-    made = {_checked(field.name, _FIELD_NAME): _description(field.type) for field in described.fields}
-    if len(made) < len(described.fields):
-        raise RemoteProtocolError(f"{described.type_name[:80]} has two fields of one name")
-    return list(made.items())
-
-
-def _description(kind: Any) -> Any:
-    number, capacity = int(kind.type_id), int(kind.capacity)
-    if number > _UNBOUNDED:
-        return (Nodetype.SEQUENCE, (_inner(kind, number - _UNBOUNDED), 0))
-    if number > _BOUNDED:
-        return (Nodetype.SEQUENCE, (_inner(kind, number - _BOUNDED), capacity))
-    if number > _ARRAY and not capacity:
-        raise RemoteProtocolError("a field is an array of no elements")
-    return (Nodetype.ARRAY, (_inner(kind, number - _ARRAY), capacity)) if number > _ARRAY else _inner(kind, number)
-
-
-def _inner(kind: Any, number: int) -> Any:
-    if number == _NESTED:
-        return (Nodetype.NAME, _checked(kind.nested_type_name, _TYPE_NAME))
-    if number not in _BASES:
-        raise RemoteProtocolError(f"a field has the type {number} of REP 2016, which ROS 1 lacks (wide characters)")
-    return (Nodetype.BASE, (_BASES[number], int(kind.string_capacity) if number == _BOUNDED_STRING else 0))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import time
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -25,7 +26,7 @@ from rmpa.gateway.rules import ACCESS, CrossingRules, SourceKind
 from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway, read_json
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
-from rmpa.gateway.sites.topics import SiteContext
+from rmpa.gateway.sites.topics import ImportedTopic, SiteContext
 from rmpa.gateway.topics import flow
 from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
@@ -34,17 +35,15 @@ from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failur
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteModule, SiteSource
-    from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.sites.topics import ImportedTopic
+    from rmpa.gateway.sites.site import SiteExport, SiteImport
     from rmpa.gateway.topics import ExportedTopic
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.session import OpenSession
+    from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession
     from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds for a question to another site's gateway.
@@ -201,7 +200,7 @@ class SiteAnswers:
     async def answer(self, what: str, args: dict[str, Any], asker: str = "", /) -> Any:
         """The reply to one question of ``observe.operations``; raises as that says."""
         name, site, module = (str(args.get(key) or "") for key in ("name", "site", "module"))
-        others = {*self._sites.catalogue.sites, *self._sites.history.away} - {self._site}
+        others = {*self._sites.catalogue.sites, *self._sites.catalogue.away} - {self._site}
         known = [self._site, *sorted(others)]
         if what == REPORT:
             return self._report(known, asker, sources=False)
@@ -231,13 +230,12 @@ class SiteAnswers:
         )
 
     def _this_site(self, name: str, asker: str, sources: bool) -> SiteInfo:
-        offered = [(source, "") for source, _ in self._sites.exports.offered()]
-        refused = [each for each in self._sites.exports.refusals() if self._owns(asker, each[0].module)]
-        visible = [each for each in offered if self._owns(asker, each[0].module)]
-        modules = sorted({(source.module, source.instance) for source, _ in offered})
+        judged = list(self._sites.exports.judged())
+        modules = sorted({(source.module, source.instance) for source, entries, _ in judged if entries})
+        visible = [each for each in judged if self._owns(asker, each[0].module)]
         rows = [
-            _source_info(source, source.module, source.here, why)
-            for source, why in sorted([*visible, *refused], key=lambda each: (each[0].name, each[0].module))
+            _source_info(source, source.module, source.here, "" if entries else why)
+            for source, entries, why in sorted(visible, key=lambda each: (each[0].name, each[0].module))
         ]
         return SiteInfo(
             name=name,
@@ -248,42 +246,37 @@ class SiteAnswers:
                 for module, run in modules
             ),
             sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
-            not_shown=len(refused),
+            not_shown=sum(bool(why) for _, _, why in visible),
         )
 
     def _other(self, name: str, asker: str, sources: bool) -> SiteInfo:
         catalogue = self._sites.catalogue
         if name not in catalogue.sites:
-            return SiteInfo(name=name, state="unreachable", since_ago=self._sites.history.since_ago(name))
-        refused = {
-            source: why
-            for source, why in self._sites.imports.refusals()
-            if source.site == name and self._rules.tells(asker, source.kind, source.name)
-        }
+            return SiteInfo(name=name, state="unreachable", since_ago=catalogue.since_ago(name, time.monotonic()))
         rows: list[SiteSourceInfo] = []
         modules = []
         for module in catalogue.modules(name):
-            each = list(self._rows(module, asker, refused))
+            each = list(self._rows(module, asker))
             modules.append(_counted(module.name, module.instance, each))
             rows += each
         gateways = catalogue.gateways(name)
         return SiteInfo(
             name=name,
             state="joined" if gateways else "no gateway",
-            since_ago=self._sites.history.since_ago(name),
+            since_ago=catalogue.since_ago(name, time.monotonic()),
             gateways=len(gateways),
             modules=tuple(modules),
             sources=tuple(rows[: limits.SITE_REPORT_SOURCES_MAX]) if sources else (),
-            not_shown=len(refused),
+            not_shown=sum(bool(row.problem) for row in rows),
             beyond=catalogue.refused(name),
         )
 
-    def _rows(self, module: SiteModule, asker: str, refused: Mapping[SiteSource, str]) -> Iterator[SiteSourceInfo]:
+    def _rows(self, module: SiteModule, asker: str) -> Iterator[SiteSourceInfo]:
         for source in self._sites.catalogue.sources(module):
-            entry = self._sites.imports.entry(source)
+            entry, why = self._sites.imports.outcome(source)
             if self._rules.tells(asker, source.kind, entry.source.name if entry is not None else source.name):
                 here = entry.source.name if entry is not None and self._sites.leads else ""
-                yield _source_info(source, module.name, here, refused.get(source, ""))
+                yield _source_info(source, module.name, here, why)
 
     async def ways(
         self, name: str, site: str = "", module: str = "", asker: str = "", *, service: bool = False
@@ -297,24 +290,19 @@ class SiteAnswers:
             asker: The module that asks, whose own sources are told of too; empty for this machine's user.
             service: Whether a service is meant.
         """
-        known = site in self._sites.catalogue.sites or site in self._sites.history.away
+        known = site in self._sites.catalogue.sites or site in self._sites.catalogue.away
         if not self._sites.leads or (site and not known and not module):
             return []  # a name that is no site's is a peer's
         kinds = (SourceKind.SERVICE,) if service else tuple(ACCESS)
 
-        def meant(there: SiteSource) -> bool:
+        def meant(there: SiteSource, entry: SiteImport | None) -> bool:
+            here = entry.source.name if entry is not None else there.name
+            named = name in (here, there.name if site else here)  # its name there is asked for with its site alone
             fits = site in ("", there.site) and module in ("", there.module.name)
-            return fits and there.kind in kinds
+            return named and fits and there.kind in kinds and self._rules.tells(asker, there.kind, here)
 
-        found = [(entry.announced, entry, "") for entry in self._sites.imports.entries if meant(entry.announced)]
-        # Its name there is asked for with its site alone.
-        shown = [each for each in found if name in (each[1].source.name, each[0].name if site else "")]
-        refused = [(there, None, why) for there, why in self._sites.imports.refusals() if meant(there)]
-        visible = [
-            (there, entry, why)
-            for there, entry, why in (*shown, *(each for each in refused if each[0].name == name))
-            if self._rules.tells(asker, there.kind, entry.source.name if entry is not None else there.name)
-        ]
+        visible = [each for each in self._sites.imports.judged() if meant(*each[:2])]
+        visible.sort(key=lambda each: each[1] is None)
         ways = list(await asyncio.gather(*(self._way(*each) for each in visible)))
         permitted = [kind for kind in kinds if self._rules.tells(asker, kind, name)]
         if site and not ways and permitted:
@@ -324,7 +312,7 @@ class SiteAnswers:
             ways.append(self._diagnosis(name, f"{site}/{module}" if module else site, "", kinds[0], [denied]))
         if site:
             return ways
-        for away, had in self._sites.history.had(name) if permitted else ():
+        for away, had in self._sites.catalogue.had(name) if permitted else ():
             ways.append(await self._no_way(name, away, had, permitted))
 
         def own(source: MeshSource) -> bool:
@@ -339,13 +327,11 @@ class SiteAnswers:
         mine = KINDS[there.kind], module
         found = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
         stages = [self._site_stage(site), *_told(site, module, there.name, found, refusal)]
-        topic = self._sites.topics.imported(entry) if entry is not None else None
-        if entry is None:
-            here = [_refused_stage("here", refused, self._site)]
-        else:
-            here = here_stages(entry, topic or self._sites.services.imported.get(entry.source))
+        found_here = self._sites.imported.get(entry.source) if entry is not None else None
+        here = [_refused_stage("here", refused, self._site)] if entry is None else here_stages(entry, found_here)
         unheard = next((at for at, stage in enumerate(stages) if stage.name == _DEMAND_THERE), None)
-        if unheard is not None and stages[unheard].level is not OK and topic is not None and topic.wanted:
+        wanted = isinstance(found_here, ImportedTopic) and found_here.wanted
+        if unheard is not None and stages[unheard].level is not OK and wanted:
             text = f"a node here subscribes, and the gateway of {site} hears of none: a router keeps it back"
             stages[unheard] = Check("router", FAIL, text, _ROUTER)
         name = entry.source.name if entry is not None else there.name
@@ -368,10 +354,11 @@ class SiteAnswers:
         return self._diagnosis(name, f"{site}/{module}" if module else site, node, kind, stages)
 
     def _site_stage(self, site: str) -> Check:
-        gateways, history = len(self._sites.catalogue.gateways(site)), self._sites.history
-        if site not in self._sites.catalogue.sites:
-            if site in history.away:
-                text = f"site {site} is unreachable since {history.since_ago(site) or 0:.0f} s"
+        catalogue = self._sites.catalogue
+        gateways = len(catalogue.gateways(site))
+        if site not in catalogue.sites:
+            if site in catalogue.away:
+                text = f"site {site} is unreachable since {catalogue.since_ago(site, time.monotonic()) or 0:.0f} s"
                 remedy = "is its gateway on, and its way to the router? `rmpa site list` there"
                 return Check("site", FAIL, text, remedy)
             text = f"no gateway of a site {site} is at the routers that this site's gateway reaches"
@@ -387,22 +374,15 @@ class SiteAnswers:
 
     def _leaving(self, meant: Callable[[MeshSource], bool], asking: str = "") -> Iterator[Diagnosis]:
         """The ways of sources of this site to the one that is ``asking``; empty: for its own module, to all."""
-        for source, entries in self._sites.exports.offered():
+        for source, entries, why in self._sites.exports.judged():
             if not meant(source):
                 continue
-            if not asking:
-                yield from (self._way_out(source, "", entry, "") for entry in entries)
-                continue
-            entry = next((each for each in entries if each.announced.to in ("", asking)), None)
-            refused = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind])
-            if entry is not None or refused:
+            refused = self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
+            offered = [entry for entry in entries if not asking or entry.announced.to in ("", asking)]
+            for entry in offered:
                 yield self._way_out(source, asking, entry, refused)
-        for source, why in self._sites.exports.refusals():
-            if meant(source):
-                denied = (
-                    self._rules.refusal(asking, source.module, source.name, ACCESS[source.kind]) if asking else ""
-                )
-                yield self._way_out(source, asking, None, denied or why)
+            if why or (refused and entries and not offered):
+                yield self._way_out(source, asking, None, refused or why)
 
     def _way_out(self, source: MeshSource, asking: str, entry: SiteExport | None, refused: str) -> Diagnosis:
         where, to = "there" if asking else "here", entry.announced.to if entry is not None else ""
@@ -463,8 +443,7 @@ class SiteAnswers:
             # Whether or not it is there: that is not told.
             stages = [_refused_stage("there", denial, self._site)]
             ways.append(self._diagnosis(question.name, question.module, "", kinds[0], stages))
-        query.reply(query.key, msgspec.json.encode(ways))
-        query.finish()
+        query.reply(msgspec.json.encode(ways))
 
 
 def _why_key(site: str) -> str:

@@ -1,4 +1,4 @@
-"""What other sites have, which gateway of a site leads, and since when a site is away. Without I/O.
+"""What other sites have or had, since when they are there or away, and which gateway of a site leads. Without I/O.
 
 Tokens come and go one by one, in any order. A source is there while its own token and that of its module are. What a
 gateway withdraws goes at once (after ``_SITE_SETTLE``); what is lost together with the leading gateway of its
@@ -13,7 +13,6 @@ the leading gateway takes everything down and up::
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
@@ -23,7 +22,9 @@ from rmpa.gateway import limits
 from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_token
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable
+
+    from rmpa.gateway.sites.site import SiteImports
 
 # Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.
@@ -31,18 +32,6 @@ _SITE_SETTLE: Final = 0.05
 
 # Seconds within which a gateway that ends withdraws what it announced: that too is what its site had.
 _ENDING: Final = 2.0
-
-
-class CatalogueChange(Enum):
-    """What has happened to a module or a source.
-
-    Attributes:
-        RENEWED: Its token had gone and came back in time: another gateway may have it now.
-    """
-
-    FOUND = "found"
-    RENEWED = "renewed"
-    GONE = "gone"
 
 
 @dataclass(slots=True)
@@ -54,6 +43,10 @@ class _Site:
     orphans: dict[SiteModule, set[SiteSource]] = field(default_factory=dict)
     # With the orphans.
     sources: int = 0
+    # Sources that have ended lately, and when.
+    ended: dict[SiteSource, float] = field(default_factory=dict)
+    # Since when it is told of.
+    since: float | None = None
     interrupted_until: float = 0.0
     refused: int = 0
 
@@ -62,23 +55,28 @@ _NO_SITE: Final = _Site()
 
 
 class SiteCatalogue:
-    """Keeps what other sites have.
+    """Keeps what other sites have, and what those had that are away.
 
     Args:
         own: This site's name, whose tokens are ignored.
-        changed: Called with each change of a module or a source. A module is found before its sources, and goes after
-            them.
+        imports: Is told of each source that is found, renewed (its token had gone and came back in time: another
+            gateway may have it now), or gone.
+        seen: ``(site, there)``: a site has come, before its sources are looked at, or has left.
         counters: ``site.token.malformed``, ``site.token.later_version``, ``site.limit``.
     """
 
     def __init__(
         self,
         own: str,
-        changed: Callable[[CatalogueChange, SiteModule | SiteSource], None],
+        imports: SiteImports,
+        seen: Callable[[str, bool], None],
         counters: Counters | None = None,
     ) -> None:
         self._own = own
-        self._tell = changed
+        self._imports = imports
+        self._seen = seen
+        # When each site left that is away, and what it had; the oldest first.
+        self._away: dict[str, tuple[float, list[SiteSource]]] = {}
         self._sites: dict[str, _Site] = {}
         # Of all sites together.
         self._sources = 0
@@ -90,6 +88,21 @@ class SiteCatalogue:
     def sites(self) -> tuple[str, ...]:
         """The names of the other sites, in order."""
         return tuple(sorted(self._sites))
+
+    @property
+    def away(self) -> tuple[str, ...]:
+        """The sites that were there and are not, by name."""
+        return tuple(sorted(self._away))
+
+    def since_ago(self, site: str, now: float) -> float | None:
+        """Seconds since a site came or left; ``None``: it was never seen."""
+        since = self._away[site][0] if site in self._away else self._sites.get(site, _NO_SITE).since
+        return None if since is None else now - since
+
+    def had(self, name: str) -> tuple[tuple[str, str], ...]:
+        """The sites that are away and had a topic or service of this name, each with its module."""
+        sources = (source for _, had in self._away.values() for source in had)
+        return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
 
     def gateways(self, site: str) -> list[SiteGateway]:
         """The gateways of another site, the leading one first."""
@@ -107,13 +120,6 @@ class SiteCatalogue:
     def refused(self, site: str) -> int:
         """Tokens of a site that were left out because there are too many."""
         return self._sites.get(site, _NO_SITE).refused
-
-    def all(self) -> Iterator[SiteModule | SiteSource]:
-        """Everything that is there, modules before their sources."""
-        for site in self.sites:
-            for module in self.modules(site):
-                yield module
-                yield from self.sources(module)
 
     def token(self, key: str, now: float, *, alive: bool) -> SiteModule | SiteSource | SiteGateway | None:
         """A liveliness token came or went. What is none is counted and ignored.
@@ -153,7 +159,7 @@ class SiteCatalogue:
             self._came(site, item, key)
         else:
             self._went(site, item, key, now)
-        self._forget_if_empty(name)
+        self._judge(name, now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is to be called; ``None``: nothing waits."""
@@ -165,12 +171,12 @@ class SiteCatalogue:
             item = self._by_token.pop(key)
             site = self._sites[item.site]
             if isinstance(item, SiteModule):
-                self._end_module(site, item)
+                self._end_module(site, item, now)
             else:
                 site.modules[item.module].discard(item)
                 self._count(site, -1)
-                self._tell(CatalogueChange.GONE, item)
-            self._forget_if_empty(item.site)
+                self._end(site, item, now)
+            self._judge(item.site, now)
 
     def _gateway(self, site: _Site, gateway: SiteGateway, now: float, *, alive: bool) -> None:
         if alive:
@@ -189,7 +195,8 @@ class SiteCatalogue:
     def _came(self, site: _Site, item: SiteModule | SiteSource, key: str) -> None:
         if self._by_token.pop(key, None) is not None:
             self._ending.set(key, None)
-            self._tell(CatalogueChange.RENEWED, item)
+            if isinstance(item, SiteSource):
+                self._imports.renewed(item)
             return
         if isinstance(item, SiteModule):
             if item in site.modules:
@@ -198,9 +205,8 @@ class SiteCatalogue:
                 self._refuse(site)
                 return
             sources = site.modules[item] = site.orphans.pop(item, set())
-            self._tell(CatalogueChange.FOUND, item)
             for source in sorted(sources, key=SiteSource.token):
-                self._tell(CatalogueChange.FOUND, source)
+                self._imports.found(source)
             return
         known = site.modules.get(item.module)
         into = known if known is not None else site.orphans.setdefault(item.module, set())
@@ -214,7 +220,7 @@ class SiteCatalogue:
         into.add(item)
         self._count(site, 1)
         if known is not None:
-            self._tell(CatalogueChange.FOUND, item)
+            self._imports.found(item)
 
     def _went(self, site: _Site, item: SiteModule | SiteSource, key: str, now: float) -> None:
         if isinstance(item, SiteSource) and item in site.orphans.get(item.module, ()):
@@ -228,7 +234,16 @@ class SiteCatalogue:
             self._by_token[key] = item
             self._ending.set(key, max(now + _SITE_SETTLE, site.interrupted_until))
 
-    def _end_module(self, site: _Site, module: SiteModule) -> None:
+    def _end(self, site: _Site, source: SiteSource, now: float) -> None:
+        """A source is gone; what ended before its site could end with it is forgotten."""
+        ended = site.ended
+        ended.pop(source, None)
+        ended[source] = now
+        while ended[oldest := next(iter(ended))] < now - _ENDING:
+            del ended[oldest]
+        self._imports.gone(source)
+
+    def _end_module(self, site: _Site, module: SiteModule, now: float) -> None:
         for source in sorted(site.modules.pop(module), key=SiteSource.token):
             key = source.token()
             self._ending.set(key, None)
@@ -237,8 +252,7 @@ class SiteCatalogue:
                 site.orphans.setdefault(module, set()).add(source)
             else:
                 self._count(site, -1)
-            self._tell(CatalogueChange.GONE, source)
-        self._tell(CatalogueChange.GONE, module)
+            self._end(site, source, now)
 
     def _count(self, site: _Site, more: int) -> None:
         site.sources += more
@@ -248,10 +262,27 @@ class SiteCatalogue:
         site.refused += 1
         self.counters.add("site.limit")
 
-    def _forget_if_empty(self, name: str) -> None:
+    def _judge(self, name: str, now: float) -> None:
+        """Tell of a site that has come, or left; of those that are away, the oldest are forgotten."""
         site = self._sites[name]
-        if not (site.gateways or site.modules or site.orphans):
-            del self._sites[name]
+        if site.gateways or site.modules or site.orphans:
+            if site.since is None:
+                site.since = now
+                self._away.pop(name, None)
+                self._seen(name, True)
+            return
+        del self._sites[name]
+        if site.since is None:
+            return
+        self._away[name] = now, [source for source, at in site.ended.items() if at >= now - _ENDING]
+        while self._away and len(self._away) + len(self._sites) > limits.SITES_REMEMBERED_MAX:
+            del self._away[next(iter(self._away))]
+        total = sum(len(had) for _, had in self._away.values())
+        for _, had in self._away.values():
+            if total > limits.SITES_SOURCES_MAX:
+                total -= len(had)
+                had.clear()
+        self._seen(name, False)
 
 
 # Which gateway of a site leads, where there are several. The others stand by, so that no message crosses twice.
@@ -308,64 +339,3 @@ class Leader:
             self.leads, self._best_since = False, None
         elif self._best_since is None:
             self._best_since = now
-
-
-# Which sites were there and are not, and what they had. For "unreachable since".
-
-
-class SiteHistory:
-    """Remembers since when other sites are there or away.
-
-    Args:
-        now: Monotonic seconds.
-    """
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._there: frozenset[str] = frozenset()
-        self._since: dict[str, float] = {}
-        # When each source was withdrawn: infinite while it is there, and 0 if it went with its site.
-        self._had: dict[str, dict[SiteSource, float]] = {}
-
-    @property
-    def away(self) -> tuple[str, ...]:
-        """The sites that were there and are not, by name."""
-        return tuple(sorted(self._since.keys() - self._there))
-
-    def since_ago(self, site: str) -> float | None:
-        """Seconds since a site came or left; ``None``: it was never seen."""
-        return self._now() - self._since[site] if site in self._since else None
-
-    def source(self, source: SiteSource, *, there: bool) -> None:
-        """A site announces a source, or withdraws it; not called for those that go together with their site."""
-        had = self._had.setdefault(source.site, {})
-        had[source] = float("inf") if there else self._now()
-        if len(had) > 2 * limits.SITE_SOURCES_MAX:
-            self._had[source.site] = self._recent(source.site)
-
-    def had(self, name: str) -> tuple[tuple[str, str], ...]:
-        """The sites that are away and had a topic or service of this name, each with its module."""
-        sources = (source for site in self.away for source in self._had.get(site, ()))
-        return tuple(sorted({(each.site, each.module.name) for each in sources if each.name == name}))
-
-    def seen(self, sites: Iterable[str]) -> None:
-        """These sites are there now, and no others."""
-        there = frozenset(sites)
-        for site in there ^ self._there:
-            self._since[site] = self._now()
-        for site in self._there - there:
-            self._had[site] = dict.fromkeys(self._recent(site), 0.0)
-        self._there = there
-        oldest_first = sorted(self.away, key=self._since.__getitem__)
-        for site in oldest_first[: max(0, len(self._since) - limits.SITES_REMEMBERED_MAX)]:
-            del self._since[site]
-            self._had.pop(site, None)
-        total = sum(len(self._had.get(site, ())) for site in oldest_first)
-        for site in oldest_first:
-            if total > limits.SITES_SOURCES_MAX:
-                total -= len(self._had.pop(site, ()))
-
-    def _recent(self, site: str) -> dict[SiteSource, float]:
-        """What a site has, or has withdrawn just now."""
-        least = self._now() - _ENDING
-        return {source: at for source, at in self._had.get(site, {}).items() if at and at >= least}

@@ -298,7 +298,7 @@ GATEWAY: Final = "-gateway"
 UNKNOWN_TYPE: Final = "*"
 _UNKNOWN: Final = "-"
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
-_RANK_MAX: Final = 999
+_RANK: Final = re.compile(r"0?[0-9]{1,3}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,53 +406,38 @@ def parse_token(key: str) -> SiteModule | SiteSource | SiteGateway | None:
     Raises:
         RemoteProtocolError: It has another form, or a name that ROS does not allow.
     """
-    if len(key) > limits.KEY_MAX:
-        raise RemoteProtocolError(f"a token of a site has {len(key)} characters; at most {limits.KEY_MAX} are read")
     chunks = key.split("/")
-    if len(chunks) < 6 or "/".join(chunks[:2]) != ROOT:
+    site, module, what, instance = chunks[2:6] if len(chunks) > 5 else ("",) * 4
+    whole = len(key) <= limits.KEY_MAX and "/".join(chunks[:2]) == ROOT and _INSTANCE.fullmatch(instance)
+    names = [site, *chunks[6:7]] if what == TO else [site]
+    if module != GATEWAY:
+        names.append(module)
+    elif not _RANK.fullmatch(what):
+        whole = None
+    if not whole or any(peer_name_problem(name) or len(name) > limits.SITE_NAME_MAX for name in names):
         raise RemoteProtocolError(f"{key[:120]!r} is not a token of a site")
-    site, module, what, instance = chunks[2:6]
-    _check_name("site", site, limits.SITE_NAME_MAX, key)
-    if not _INSTANCE.fullmatch(instance):
-        raise RemoteProtocolError(f"{key[:120]!r}: {instance[:40]!r} is not a run of 32 hexadecimal digits")
     if module == GATEWAY:
-        if not (what.isascii() and what.isdigit() and int(what[:4]) <= _RANK_MAX and len(what) <= 4):
-            raise RemoteProtocolError(f"{key[:120]!r}: {what[:20]!r} is not a rank from 0 to {_RANK_MAX}")
         return SiteGateway(site, int(what), instance) if len(chunks) == 6 else None
-    _check_name("module", module, limits.SITE_NAME_MAX, key)
     found = SiteModule(site, module, instance)
     if what == TO and len(chunks) > 6:
-        _check_name("site", chunks[6], limits.SITE_NAME_MAX, key)
         return _source(found, chunks[7:], key, chunks[6])
     if what != _UP:
         return None
-    if len(chunks) == 6:
-        return found
-    return _source(found, chunks[6:], key)
+    return _source(found, chunks[6:], key) if len(chunks) > 6 else found
 
 
 def _source(module: SiteModule, chunks: list[str], key: str, to: str = "") -> SiteSource | None:
-    if len(chunks) != 4:
+    if len(chunks) != 4 or chunks[0] not in list(SourceKind):
         return None
-    try:
-        kind = SourceKind(chunks[0])
-    except ValueError:
-        return None
+    kind = SourceKind(chunks[0])
     type_name, node, name = (chunk.replace("%", "/") for chunk in chunks[1:])
     if kind is SourceKind.SERVICE and type_name == _UNKNOWN:
         type_name = UNKNOWN_TYPE
     elif not is_type_name(type_name):
         raise RemoteProtocolError(f"{key[:200]!r}: {type_name[:80]!r} is not a type")
-    for each in (node, name):
-        if not is_global_name(each):
-            raise RemoteProtocolError(f"{key[:200]!r}: {each[:80]!r} is not a global name")
+    if not (is_global_name(node) and is_global_name(name)):
+        raise RemoteProtocolError(f"{key[:200]!r} has a name that is no global name")
     return SiteSource(module, kind, type_name, node, name, to)
-
-
-def _check_name(what: str, name: str, longest: int, key: str) -> None:
-    problem = peer_name_problem(name)
-    if problem is not None or len(name) > longest:
-        raise RemoteProtocolError(f"{key[:120]!r}: {name[:40]!r} is not the name of a {what}")
 
 
 def _chunk(name: str) -> str:

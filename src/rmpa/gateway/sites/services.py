@@ -37,10 +37,9 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
     from rmpa.gateway.rules import ForeignSource, MeshSource
-    from rmpa.gateway.sites.keys import SiteSource
-    from rmpa.gateway.sites.plans import SiteExport, SiteImport
+    from rmpa.gateway.sites.site import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
+    from rmpa.gateway.zenoh.session import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer
 
 # Bytes of the description of another site's service: four names.
@@ -131,7 +130,7 @@ class ExportedService:
                 why = f"service {source.name} is of the type {has}, not {asked}"
         except RemoteProtocolError as error:
             md5, why = NO_MD5, str(error)
-        if not why and self._part.is_full(size):
+        if not why and (size > ros_limits.SERVICE_MESSAGE_MAX or self._part.waiting + size > _SITE_CALL_BYTES):
             why = f"{len(self.answering)} calls of service {source.name} wait already; try again later"
         if why:
             query.reply_error(why)
@@ -196,10 +195,10 @@ class ImportedService:
         self.calls = self.failed = 0
         self._shown = context.graph.show_service(entry.source, self._serve, self._describe)
 
-    def renew(self, source: SiteSource) -> None:
-        """It is of another run of its module: calls under way end with an error, and its type is unknown."""
+    def renew(self, entry: SiteImport) -> None:
+        """It is of another run of its module, or its way was interrupted: calls under way end with an error."""
         self._asking.cancel()
-        self._source, self._description = source, None
+        self._source, self._description = entry.announced, None
 
     def close(self) -> None:
         """Take it back; calls under way end with an error at once."""
@@ -276,45 +275,23 @@ class SiteServices:
     def __init__(self, context: SiteContext) -> None:
         self.context = context
         self.waiting = 0
-        # By module, service and the site that it is for.
-        self._exported: dict[tuple[str, str, str], ExportedService] = {}
-        self.imported: dict[ForeignSource, ImportedService] = {}
+        self._exported: dict[SiteExport, ExportedService] = {}
         self._ending: list[Answering] = []
-
-    def is_full(self, size: int) -> bool:
-        """Whether a request of this size finds no room."""
-        return size > ros_limits.SERVICE_MESSAGE_MAX or self.waiting + size > _SITE_CALL_BYTES
 
     def export(self, entry: SiteExport) -> None:
         """Let other sites call a service."""
-        self._exported[_key(entry)] = ExportedService(entry, self)
+        self._exported[entry] = ExportedService(entry, self)
 
     def withdraw(self, entry: SiteExport) -> None:
         """Take it back; calls under way end as the server lets them."""
-        gone = self._exported.pop(_key(entry))
+        gone = self._exported.pop(entry)
         gone.queryable.close()
         self._ending = [*(each for each in self._ending if each), gone.answering]
-
-    def show(self, entry: SiteImport) -> None:
-        """Show a service of another site."""
-        self.imported[entry.source] = ImportedService(entry, self.context)
-
-    def renew(self, entry: SiteImport) -> None:
-        """It is of another run of its module, or its way was interrupted."""
-        self.imported[entry.source].renew(entry.announced)
-
-    def hide(self, entry: SiteImport) -> None:
-        """Take a service back."""
-        self.imported.pop(entry.source).close()
 
     async def close(self) -> None:
         """End calls under way with an error."""
         for each in (*self._ending, *(exported.answering for exported in self._exported.values())):
             await each.close()
-
-
-def _key(entry: SiteExport) -> tuple[str, str, str]:
-    return entry.source.module, entry.source.name, entry.announced.to
 
 
 class SiteActions:

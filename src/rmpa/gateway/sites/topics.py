@@ -20,6 +20,7 @@ from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, Seque
 from rmpa.gateway.topics import ExportedTopic
 from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
@@ -29,10 +30,9 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contract, Contracts
     from rmpa.core.statistics import Counters
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.rules import CrossingRules
-    from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.zenoh.queries import ArrivedQuery
-    from rmpa.gateway.zenoh.session import Declaration, OpenSession
+    from rmpa.gateway.rules import CrossingRules, ForeignSource
+    from rmpa.gateway.sites.site import SiteExport, SiteImport
+    from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
     from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription
 
@@ -111,26 +111,25 @@ def qos_of(contract: Contract, *, latching: bool = False, large: bool = False) -
     )
 
 
-class SiteDialect:
-    """To other sites messages go as they are: the dialect of an ``ExportedTopic``.
+class SiteExportedTopic(ExportedTopic):
+    """A publisher of this site for others: messages go as they are.
 
     Args:
         entry: The source.
-        contract: The topic's contract.
+        context: What is shared with services.
 
     Attributes:
         run: By which the numbers of its messages are told apart from those of an earlier export.
     """
 
-    def __init__(self, entry: SiteExport, contract: Contract) -> None:
+    def __init__(self, entry: SiteExport, context: SiteContext) -> None:
+        super().__init__(entry.source, context.graph, context.session, entry.rate, entry.size)
         self._announced = entry.announced
-        self._contract = contract
+        self._contract = context.contracts.of(entry.source.here, entry.announced.type)
         self.run: Final = max(1, time.time_ns())
-        self.payload: Callable[[memoryview], bytes] = bytes
-        self.attachment: Callable[[int, int], bytes]
 
     def announce(self, about: TopicDescription | None, *, latched: bool, large: bool) -> tuple[str, ZenohQos]:
-        """Of ``ExportDialect``."""
+        """Of ``ExportedTopic``."""
         if about is not None:
             source = self._announced
             try:
@@ -150,11 +149,13 @@ class SiteDialect:
         reliable = self._contract.reliability is Reliability.RELIABLE
         return max(_TAP_LINGER, self._contract.resume_window if reliable else 0.0)
 
-    def say(self, problem: str) -> None:
-        """``rmpa why`` tells it, and no log."""
-
-    def close(self) -> None:
-        """The neighbour takes the token back."""
+    async def answer_header(self, _query: ArrivedQuery) -> tuple[bytes, bytes]:
+        """The answer to a question for its publisher's header."""
+        about = await self.header(_HEADER_TIMEOUT * 0.8)
+        definition = about.definition.encode(errors="replace").decode()  # JSON has no bytes that are not UTF-8
+        fields = about.type, about.md5sum, definition, about.latching
+        header = TopicHeader(*fields, self.source.node, self.run, self.messages, self.waiting)
+        return msgspec.json.encode(header), b""
 
 
 class ImportedTopic:
@@ -167,8 +168,7 @@ class ImportedTopic:
 
     Args:
         entry: The source.
-        part: Subscribes to its key.
-        interrupted: What ``close`` returned before, if the same topic was there and went.
+        part: Subscribes to its key, and keeps its counts if it goes while nodes subscribe.
 
     Attributes:
         wanted: Whether its key is subscribed to for it.
@@ -176,8 +176,8 @@ class ImportedTopic:
 
     # More than twelve fields: demand, header, and the counts of what was lost meanwhile change each other.
 
-    def __init__(self, entry: SiteImport, part: SiteTopics, interrupted: Interrupted | None = None) -> None:
-        now = time.monotonic()
+    def __init__(self, entry: SiteImport, part: SiteTopics) -> None:
+        now, interrupted = time.monotonic(), part.interrupted.pop(entry.source, None)
         self.entry = entry
         self.wanted = False
         self._part = part
@@ -192,8 +192,7 @@ class ImportedTopic:
         self._last_latched: bytes | None = None
         self.mismatched = self.dropped = 0
         self._task: asyncio.Task[None] | None = None
-        self._linger: asyncio.TimerHandle | None = None
-        self._checking: asyncio.TimerHandle | None = None
+        self._linger, self._checking = Delay(), Delay()
         self._topic = part.context.graph.show_topic(entry.source, self._demand)
 
     def take(self, payload: bytes, sequence: int, source: MessageSource) -> None:
@@ -245,23 +244,24 @@ class ImportedTopic:
             self._rate_since = rate, since + passed, self.messages
         return rate
 
-    def close(self) -> Interrupted | None:
-        """Take it out of the graph; what it returns is for the same topic once it is back."""
-        interrupted = None
-        if self.wanted and self._linger is None:
-            interrupted = self._sequence, self.messages
+    def close(self) -> None:
+        """Take it out of the graph; its counts are kept for the same topic once it is back."""
+        if self.wanted and not self._linger:
+            kept = self._part.interrupted
+            kept[self.entry.source] = self._sequence, self.messages
+            if len(kept) > limits.INTERRUPTED_TOPICS_MAX:
+                del kept[next(iter(kept))]
             self._sequence = SequenceCounter()
         if self._task is not None:
             self._task.cancel()
         self._detach()
         self._topic.close()
-        return interrupted
 
     def _demand(self, wanted: bool) -> None:
-        self._stop_lingering()
+        self._linger.cancel()
         if not wanted:
             if self.wanted:
-                self._linger = asyncio.get_running_loop().call_later(_DEMAND_LINGER, self._detach)
+                self._linger.set(_DEMAND_LINGER, self._detach)
         elif not self.wanted:
             self.wanted = True
             if time.monotonic() > self._resumes_until:
@@ -271,18 +271,12 @@ class ImportedTopic:
             self._check_in(_IDLE_CHECK)
             self._ask()
 
-    def _stop_lingering(self) -> None:
-        if self._linger is not None:
-            self._linger.cancel()
-            self._linger = None
-
     def _detach(self) -> None:
-        self._stop_lingering()
+        self._linger.cancel()
         if not self.wanted:
             return
         self.wanted = False
-        if self._checking is not None:
-            self._checking.cancel()
+        self._checking.cancel()
         self._part.unsubscribe(self)
         # The next subscriber gets the last message from over there.
         self._sequence.restart()
@@ -291,9 +285,7 @@ class ImportedTopic:
         self._held.clear()
 
     def _check_in(self, pause: float) -> None:
-        if self._checking is not None:
-            self._checking.cancel()
-        self._checking = asyncio.get_running_loop().call_later(pause, self._check, pause)
+        self._checking.set(pause, partial(self._check, pause))
 
     def _check(self, pause: float) -> None:
         if self._fresh:
@@ -362,12 +354,6 @@ class ImportedTopic:
         self._ask()
 
 
-# The counts of a topic that went while nodes subscribed, so that what is lost meanwhile is counted.
-Interrupted = tuple[SequenceCounter, int]
-# Site, module, node and name there.
-_Ident = tuple[str, str, str, str]
-
-
 @dataclass(slots=True)
 class _Subscription:
     """The subscription to one topic of one module at another site, which its publishers share.
@@ -391,14 +377,14 @@ class SiteTopics:
 
     Attributes:
         questions: Declare what is answered about headers and definitions while this gateway leads its site.
+        interrupted: The counts of topics that went while nodes subscribed, so that what is lost meanwhile is counted.
     """
 
     def __init__(self, context: SiteContext) -> None:
         self.context = context
         # By module and topic, then by node and the site that it is for (empty: for all).
-        self._exported: dict[tuple[str, str], dict[tuple[str, str], tuple[ExportedTopic, SiteDialect]]] = {}
-        self._imported: dict[_Ident, ImportedTopic] = {}
-        self._interrupted: dict[_Ident, Interrupted] = {}
+        self._exported: dict[tuple[str, str], dict[tuple[str, str], SiteExportedTopic]] = {}
+        self.interrupted: dict[ForeignSource, tuple[SequenceCounter, int]] = {}
         self._subscriptions: dict[str, _Subscription] = {}
         self._reader = AttachmentReader()
         self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
@@ -410,45 +396,21 @@ class SiteTopics:
 
     def export(self, entry: SiteExport) -> None:
         """Declare a publisher of this site, for other sites."""
-        source, announced, context = entry.source, entry.announced, self.context
-        dialect = SiteDialect(entry, context.contracts.of(source.here, announced.type))
-        export = ExportedTopic(source, context.graph, context.session, dialect, entry.rate, entry.size)
-        self._exported.setdefault((source.module, source.name), {})[source.node, announced.to] = export, dialect
+        source, export = entry.source, SiteExportedTopic(entry, self.context)
+        self._exported.setdefault((source.module, source.name), {})[source.node, entry.announced.to] = export
         export.start()
 
     def withdraw(self, entry: SiteExport) -> None:
         """Undeclare it."""
         key = (entry.source.module, entry.source.name)
-        self._exported[key].pop((entry.source.node, entry.announced.to))[0].close()
+        self._exported[key].pop((entry.source.node, entry.announced.to)).close()
         if not self._exported[key]:
             del self._exported[key]
 
-    def show(self, entry: SiteImport) -> None:
-        """Show a publisher of another site."""
-        ident = _ident(entry)
-        self._imported[ident] = ImportedTopic(entry, self, self._interrupted.pop(ident, None))
-
-    def renew(self, entry: SiteImport) -> None:
-        """It is of another run of its module, or comes by another gateway."""
-        self._imported[_ident(entry)].renew(entry)
-
-    def hide(self, entry: SiteImport) -> None:
-        """Take it out of the graph."""
-        interrupted = self._imported.pop(_ident(entry)).close()
-        if interrupted is not None:
-            self._interrupted[_ident(entry)] = interrupted
-            if len(self._interrupted) > limits.INTERRUPTED_TOPICS_MAX:
-                del self._interrupted[next(iter(self._interrupted))]
-
-    def exported(self, entry: SiteExport) -> ExportedTopic | None:
+    def exported(self, entry: SiteExport) -> SiteExportedTopic | None:
         """A topic that goes out."""
         topics = self._exported.get((entry.source.module, entry.source.name), {})
-        found = topics.get((entry.source.node, entry.announced.to))
-        return found[0] if found is not None else None
-
-    def imported(self, entry: SiteImport) -> ImportedTopic | None:
-        """A topic that comes in."""
-        return self._imported.get(_ident(entry))
+        return topics.get((entry.source.node, entry.announced.to))
 
     async def close(self) -> None:
         """End it: everything was withdrawn and hidden before."""
@@ -507,26 +469,13 @@ class SiteTopics:
         if found is None:
             query.reply_error(f"no such publisher of {name[:200]} at {module[:64]}")
         else:
-            self._headers.take(query, partial(self._header, *found))
-
-    @staticmethod
-    async def _header(export: ExportedTopic, dialect: SiteDialect, _query: ArrivedQuery) -> tuple[bytes, bytes]:
-        about = await export.header(_HEADER_TIMEOUT * 0.8)
-        definition = about.definition.encode(errors="replace").decode()  # JSON has no bytes that are not UTF-8
-        fields = about.type, about.md5sum, definition, about.latching
-        header = TopicHeader(*fields, export.source.node, dialect.run, export.messages, export.waiting)
-        return msgspec.json.encode(header), b""
+            self._headers.take(query, found.answer_header)
 
     def _asked_definition(self, query: ArrivedQuery) -> None:
         module, _, md5 = query.key.removeprefix(f"{ROOT}/{self.context.name}/").partition("/d/m/")
         of_module = (nodes for (name, _), nodes in self._exported.items() if name == module)
-        for about in (export.about for nodes in of_module for export, _ in nodes.values()):
+        for about in (export.about for nodes in of_module for export in nodes.values()):
             if about is not None and about.md5sum == md5:
-                query.reply(query.key, about.definition.encode(errors="surrogateescape"))
-                query.finish()
+                query.reply(about.definition.encode(errors="surrogateescape"))
                 return
         query.reply_error(f"no publisher with the md5 sum {md5[:40]} was connected yet")
-
-
-def _ident(entry: SiteImport) -> _Ident:
-    return entry.source.site, entry.source.module, entry.source.node, entry.announced.name

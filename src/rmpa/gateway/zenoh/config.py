@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.trust.certificates import DenyList
+    from rmpa.trust.store import MemberFiles
 
 _log = logging.getLogger(__name__)
 
@@ -56,38 +57,6 @@ _INSECURE: Final = "or say --insecure, and every program that reaches it may rea
 
 
 @dataclass(frozen=True, slots=True)
-class MeshCertificates:
-    """The files (PEM) that prove a module's name to other members of its secured mesh.
-
-    Args:
-        authority: The certificate of the mesh's authority; only what it has signed is let in.
-        certificate: The module's certificate.
-        key: Its private key.
-    """
-
-    authority: str
-    certificate: str
-    key: str
-
-    def entries(self) -> dict[str, object]:
-        """Zenoh's configuration of TLS: both sides show a certificate of the mesh.
-
-        The name of the host is not checked where we connect: a certificate of the mesh names a module. An endpoint
-        may ask for it: ``tls/fleet.local:7447#verify_name_on_connect=true``.
-        """
-        return {
-            "root_ca_certificate": self.authority,
-            "connect_certificate": self.certificate,
-            "connect_private_key": self.key,
-            "listen_certificate": self.certificate,
-            "listen_private_key": self.key,
-            "enable_mtls": True,
-            "verify_name_on_connect": False,
-            "close_link_on_expiration": True,
-        }
-
-
-@dataclass(frozen=True, slots=True)
 class ZenohConfig:
     """The configuration of one session.
 
@@ -96,7 +65,8 @@ class ZenohConfig:
             that reach only a router exchange nothing, so what only connects is a client.
         connect: Endpoints to connect to.
         listen: Endpoints to listen at.
-        certificates: For encrypted endpoints; ``None``: there are none.
+        certificates: The folder with the files of a member of a secured mesh, for encrypted endpoints; ``None``:
+            there are none.
         access_control: Zenoh's table of who may do what; ``None``: everything.
         uplink: Bytes a second that the line carries; ``None``: it is not known, and Linux sizes the buffers.
     """
@@ -104,7 +74,7 @@ class ZenohConfig:
     mode: str = "client"
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
-    certificates: MeshCertificates | None = None
+    certificates: Path | None = None
     access_control: Mapping[str, object] | None = None
     uplink: int | None = None
 
@@ -132,7 +102,7 @@ class ZenohConfig:
             "timestamping/enabled": True,
         }
         if self.certificates is not None:
-            entries["transport/link/tls"] = self.certificates.entries()
+            entries["transport/link/tls"] = _tls_entries(self.certificates)
         if self.uplink is not None:
             buffer = max(_SEND_BUFFER_MIN, round(self.uplink * _SEND_BUFFER))
             batch = min(_BATCH_MAX, max(_BATCH_MIN, round(self.uplink * _BATCH)))
@@ -142,13 +112,61 @@ class ZenohConfig:
             entries["access_control"] = self.access_control
         return entries
 
+    def stamp(self) -> tuple[int, int] | None:
+        """What changes when the certificate of what listens is replaced; ``None``: none, or not seen."""
+        if self.certificates is None or not self.listen:
+            return None
+        try:
+            info = (self.certificates / CERTIFICATE).stat()
+        except OSError:
+            return None
+        return info.st_ino, info.st_mtime_ns
 
-def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | None) -> ZenohConfig:
+    def start_error(self, reason: str) -> StartError:
+        """The error of a session that could not be opened, for what Zenoh says."""
+        where = ", ".join((*self.connect, *self.listen)) or "its default endpoints"
+        if "listener" in reason or "in use" in reason:
+            remedy = "choose another --listen, or stop the program that listens there"
+        elif "certificate" in reason.lower() or "tls" in reason.lower():
+            remedy = "both sides need certificates of the same mesh: see rmpa trust status"
+        else:
+            remedy = "start the router there, or correct --connect"
+        return StartError(f"zenoh {where}", reason, remedy)
+
+
+def reason_of(error: Exception) -> str:
+    """The text of an error of Zenoh without the places in Zenoh's source."""
+    text = str(error).strip()
+    while (at := text.rfind(" at /")) > 0:
+        text = text[:at].rstrip(" .;[")
+    return text
+
+
+def _tls_entries(folder: Path) -> dict[str, object]:
+    """Zenoh's configuration of TLS: both sides show a certificate of the mesh, whose authority has signed it.
+
+    The name of the host is not checked where we connect: a certificate of the mesh names a module. An endpoint may
+    ask for it: ``tls/fleet.local:7447#verify_name_on_connect=true``.
+    """
+    certificate, key = str(folder / CERTIFICATE), str(folder / KEY)
+    return {
+        "root_ca_certificate": str(folder / CA),
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+        "close_link_on_expiration": True,
+    }
+
+
+def gateway_config(settings: GatewaySettings, certificates: Path | None) -> ZenohConfig:
     """What the session of a gateway is opened with; without a table of access.
 
     Args:
         settings: Its endpoints, and whether it is a router.
-        certificates: Of the gateway's module; ``None``: it has joined no secured mesh.
+        certificates: The folder of the gateway's module; ``None``: it has joined no secured mesh.
 
     Raises:
         StartError: An endpoint needs certificates that are not there, or is not encrypted although ``insecure`` is
@@ -162,19 +180,7 @@ def gateway_config(settings: GatewaySettings, certificates: MeshCertificates | N
     return ZenohConfig(mode, settings.connect, settings.listen, certificates, uplink=settings.uplink)
 
 
-def zenohd_entries(config: ZenohConfig) -> dict[str, object]:
-    """The same as a nested object, which a configuration file has."""
-    nested: dict[str, Any] = {}
-    for path, value in replace(config, mode="router").entries().items():
-        inner = nested
-        *above, last = path.split("/")
-        for part in above:
-            inner = inner.setdefault(part, {})
-        inner[last] = value
-    return nested
-
-
-def _problem(endpoint: str, certificates: MeshCertificates | None) -> tuple[str, str] | None:
+def _problem(endpoint: str, certificates: Path | None) -> tuple[str, str] | None:
     """Why an endpoint is refused, and the remedy."""
     protocol, _, address = endpoint.partition("/")
     if protocol in _ENCRYPTED:
@@ -227,17 +233,16 @@ def session_config(settings: Settings) -> ZenohConfig:
         StartError: As ``gateway_config``; or the certificates are not whole, or other users can read them.
     """
     store = trust_store(settings)
-    certificates = None
-    if store is not None and store.exists:
-        store.load()
-        certificates = MeshCertificates(*(str(store.path(name)) for name in (CA, CERTIFICATE, KEY)))
-    config = gateway_config(settings.gateway, certificates)
-    if certificates is None or not config.listen:
+    if store is None or not store.exists:
+        return gateway_config(settings.gateway, None)
+    files = store.load()
+    config = gateway_config(settings.gateway, store.folder)
+    if not config.listen:
         return config
-    return replace(config, access_control=access_table(settings))
+    return replace(config, access_control=_access_table(settings, _deny_list(files, store.path(DENY))))
 
 
-def access_table(settings: Settings) -> dict[str, object]:
+def _access_table(settings: Settings, deny: DenyList | None) -> dict[str, object]:
     """Zenoh's ``access_control``: members may use the keys of sites, revoked modules nothing.
 
     Zenoh allows a certificate what it allows to everybody, whatever is denied to its name, and knows it by its name
@@ -249,7 +254,7 @@ def access_table(settings: Settings) -> dict[str, object]:
         domain = settings.gateway.ros2.domain
         keys = (*keys, "@ros2_lv/**", f"{domain}/**", f"{domain}/**/@adv/**")
     subject: dict[str, object] = {"id": "members"}
-    if (deny := _deny_list(settings)) is not None and (revoked := deny.in_force(time.time())):
+    if deny is not None and (revoked := deny.in_force(time.time())):
         # Never empty, which would be everybody.
         named = sorted({*deny.members, settings.name}.difference(revoked)) or [settings.name]
         subject["cert_common_names"] = named
@@ -274,19 +279,22 @@ def zenohd_config(settings: Settings) -> str:
     text = _HEAD.format(days=CERTIFICATE_LIFETIME * RENEWAL_SHARE / 86_400)
     if config.certificates is None:
         text += "// INSECURE: no certificates, and no rules of access.\n"
-    return text + json.dumps(zenohd_entries(config), indent=2) + "\n"
+    nested: dict[str, Any] = {}
+    for path, value in config.entries().items():
+        inner = nested
+        *above, last = path.split("/")
+        for part in above:
+            inner = inner.setdefault(part, {})
+        inner[last] = value
+    return text + json.dumps(nested, indent=2) + "\n"
 
 
-def _deny_list(settings: Settings) -> DenyList | None:
-    """The deny list of this module's mesh; ``None``: nothing was ever revoked, or it has joined none.
+def _deny_list(files: MemberFiles, path: Path) -> DenyList | None:
+    """The deny list of this module's mesh; ``None``: nothing was ever revoked.
 
     Raises:
-        StartError: The files of trust are not whole, or the deny list is broken.
+        StartError: It is broken.
     """
-    store = trust_store(settings)
-    if store is None or not store.exists:
-        return None
-    files = store.load()
     if not files.deny:
         return None
     from rmpa.trust.certificates import DenyList, ca_public_key, read_document  # noqa: PLC0415 - the extra rmpa[trust]
@@ -294,9 +302,7 @@ def _deny_list(settings: Settings) -> DenyList | None:
     try:
         return read_document(files.deny, ca_public_key(files.ca), DenyList)
     except RemoteProtocolError as error:
-        raise StartError(
-            str(store.path(DENY)), f"is broken: {error}", "see rmpa trust status", code="keys-unusable"
-        ) from None
+        raise StartError(str(path), f"is broken: {error}", "see rmpa trust status", code="keys-unusable") from None
 
 
 # Bounds what the kernel holds unsent of Zenoh's connections, so that priorities hold on a slow line too.
@@ -311,53 +317,40 @@ _FILES: Final = Path("/proc/self/fd")
 _STREAMS: Final = frozenset({"tcp", "tls", "ws"})
 
 
-class SocketTuning:
-    """Tunes the sockets of Zenoh's connections, each once.
+def bound_unsent(endpoints: Collection[str], unsent: int = _UNSENT_BYTES) -> int:
+    """Bound what the kernel may hold unsent of some connections.
 
     Args:
-        unsent: Bytes that the kernel may hold unsent of one connection.
+        endpoints: Those of the other side of each, such as ``tcp/192.0.2.1:7447``.
+        unsent: Bytes of one connection.
+
+    Returns:
+        The number of sockets that were tuned.
     """
+    wanted = {found for each in endpoints if (found := _address(each)) is not None}
+    try:
+        numbers = [int(entry.name) for entry in _FILES.iterdir()] if wanted else []
+    except OSError:
+        return 0  # no /proc, or no file descriptor is left
+    count = sum(_tune(number, wanted, unsent) for number in numbers)
+    _log.debug("= %d of Zenoh's sockets hold at most %d bytes unsent", count, unsent)
+    return count
 
-    def __init__(self, unsent: int = _UNSENT_BYTES) -> None:
-        self._unsent = unsent
-        self._tuned: frozenset[str] = frozenset()
 
-    def look(self, endpoints: Collection[str]) -> int:
-        """Tune the connections to these endpoints, if some are new.
-
-        Args:
-            endpoints: Those of the other side of each connection that is up, such as ``tcp/192.0.2.1:7447``.
-
-        Returns:
-            The number of sockets that were tuned.
-        """
-        there = frozenset(endpoints)
-        if there == self._tuned:
-            return 0
-        wanted = {found for each in there - self._tuned if (found := _address(each)) is not None}
-        self._tuned = there
-        try:
-            numbers = [int(entry.name) for entry in _FILES.iterdir()] if wanted else []
-        except OSError:
-            return 0  # no /proc, or no file descriptor is left
-        count = sum(self._tune(number, wanted) for number in numbers)
-        _log.debug("= %d of Zenoh's sockets hold at most %d bytes unsent", count, self._unsent)
-        return count
-
-    def _tune(self, number: int, wanted: Collection[tuple[str, int]]) -> bool:
-        try:
-            if not stat.S_ISSOCK(os.fstat(number).st_mode):
+def _tune(number: int, wanted: Collection[tuple[str, int]], unsent: int) -> bool:
+    try:
+        if not stat.S_ISSOCK(os.fstat(number).st_mode):
+            return False
+        with socket.socket(fileno=os.dup(number)) as found:
+            if found.family not in (socket.AF_INET, socket.AF_INET6) or found.type != socket.SOCK_STREAM:
                 return False
-            with socket.socket(fileno=os.dup(number)) as found:
-                if found.family not in (socket.AF_INET, socket.AF_INET6) or found.type != socket.SOCK_STREAM:
-                    return False
-                address, port = found.getpeername()[:2]
-                if (address.removeprefix("::ffff:"), port) not in wanted:
-                    return False
-                found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, self._unsent)
-        except OSError:
-            return False  # closed meanwhile, not connected, or no TCP
-        return True
+            address, port = found.getpeername()[:2]
+            if (address.removeprefix("::ffff:"), port) not in wanted:
+                return False
+            found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, unsent)
+    except OSError:
+        return False  # closed meanwhile, not connected, or no TCP
+    return True
 
 
 def _address(endpoint: str) -> tuple[str, int] | None:

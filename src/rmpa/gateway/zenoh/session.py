@@ -11,23 +11,25 @@ import asyncio
 import contextlib
 import json
 import logging
-from pathlib import Path
+import threading
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError, missing_extra
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import SocketTuning, session_config
-from rmpa.gateway.zenoh.queries import ArrivedQuery, PendingGet, SerialWorker, content
+from rmpa.gateway.zenoh.config import bound_unsent, reason_of, session_config
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
     Arrivals,
     QueuedPublisher,
     SendingLane,
+    SerialWorker,
     ZenohPriority,
     ZenohSample,
+    call_loop,
     keep_thread_state,
 )
 from rmpa.runtime.accept import in_thread
+from rmpa.runtime.loop import Delay
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.policy import Needs
     from rmpa.config.settings import Settings
     from rmpa.gateway.zenoh.config import ZenohConfig
-    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohReply
+    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
@@ -47,7 +49,122 @@ _CLOSE_MAX: Final = 3.0
 # Seconds beyond a query's own time-out after which its answers are no longer waited for.
 _GET_GRACE: Final = 1.0
 
-_WILD: Final = frozenset("*$")
+_BUSY: Final = "too many answers wait at this gateway; ask again later"
+
+
+def content(data: Any) -> bytes:
+    """The bytes of a payload or an attachment of Zenoh; empty for none."""
+    return b"" if data is None else bytes(data.to_bytes())
+
+
+class ArrivedQuery:
+    """A query that has come, and whose answers go out by a thread.
+
+    Args:
+        query: Zenoh's query.
+        worker: The thread that answers.
+        arrivals: Has room for the answers that wait.
+    """
+
+    def __init__(self, query: Any, worker: SerialWorker, arrivals: Arrivals) -> None:
+        self._query: Any = query
+        self._worker = worker
+        self._arrivals = arrivals
+        self.key = str(query.key_expr)
+        self.parameters = str(query.parameters)
+        self.payload = content(query.payload)
+        self.attachment = content(query.attachment)
+
+    def reply(self, payload: Buffer, attachment: bytes = b"") -> None:
+        """Give the answer, and finish."""
+        query = self._query
+        if query is None:
+            return
+        if not self._arrivals.take_room(len(payload)):
+            self.reply_error(_BUSY)
+            return
+        body = payload if isinstance(payload, bytes) else bytes(payload)
+        self._worker.submit(lambda: self._give(query, body, attachment))
+        self.finish()
+
+    def _give(self, query: Any, body: bytes, attachment: bytes) -> None:
+        try:
+            query.reply(self.key, body, attachment=attachment or None)
+        finally:
+            self._arrivals.free_room(len(body))
+
+    def reply_error(self, text: str) -> None:
+        """Answer with an error, and finish."""
+        query = self._query
+        if query is not None:
+            self._worker.submit(lambda: query.reply_err(text))
+            self.finish()
+
+    def finish(self) -> None:
+        """Say that no answer comes."""
+        query, self._query = self._query, None
+        if query is not None:
+            self._worker.submit(query.drop)
+
+
+class PendingGet:
+    """A query that was asked; collects its answers in Zenoh's threads, within ``limits.REPLIES_MAX``.
+
+    Args:
+        done: Resolved in the event loop with all answers, as soon as there are too many.
+        arrivals: Counts answers that are dropped, and calls functions in the event loop.
+
+    Attributes:
+        unfinished: Whether it was resolved because there were too many answers, and more may come.
+    """
+
+    def __init__(self, done: asyncio.Future[list[ZenohSample]], arrivals: Arrivals) -> None:
+        self._done = done
+        self._arrivals = arrivals
+        self._lock = threading.Lock()
+        self._replies: list[ZenohSample] = []
+        self._bytes = 0
+        self.unfinished = False
+
+    def add(self, reply: Any) -> None:
+        """Take one answer. Zenoh's own for a time-out, here or in a router on the way, is left out."""
+        if self.unfinished:
+            self._arrivals.refuse("zenoh.reply.limit")
+            return
+        sample = reply.ok
+        if sample is not None:
+            if sample.attachment is not None and len(sample.attachment) > limits.ATTACHMENT_MAX:
+                self._arrivals.refuse("zenoh.attachment.long")
+                return
+            answer = ZenohSample(content(sample.payload), content(sample.attachment))
+        elif reply.replier_id is None or not reply.replier_id.eid:
+            return  # no queryable has the entity id 0
+        else:
+            answer = ZenohSample(content(reply.err.payload), ok=False)
+        size = len(answer.payload) + len(answer.attachment)
+        with self._lock:
+            self.unfinished = bool(self._replies) and (
+                len(self._replies) >= limits.REPLIES_MAX or self._bytes + size > limits.REPLY_BYTES_MAX
+            )
+            if not self.unfinished:
+                self._bytes += size
+                self._replies.append(answer)
+                return
+        self._arrivals.refuse("zenoh.reply.limit")
+        self.finish()
+
+    def finish(self) -> None:
+        """Resolve with what has come; called from any thread, and again without effect."""
+        call_loop(self._arrivals.loop, self._settle)
+
+    def collected(self) -> list[ZenohSample]:
+        """The answers up to now."""
+        with self._lock:
+            return list(self._replies)
+
+    def _settle(self) -> None:
+        if not self._done.done():
+            self._done.set_result(self.collected())
 
 
 class Declaration:
@@ -101,21 +218,18 @@ class OpenSession:
     Args:
         library: The module ``zenoh``.
         session: Zenoh's session.
-        loop: The event loop in which all callbacks are called.
-        stale: Whether it has to be opened anew for others to connect: its certificate or table of access is another.
-            Zenoh reads the table and the certificate of a listener once, and that of a connection each time.
+        config: What it was opened with.
+        settings: What that was made of, and is made of again; ``None``: it stays as it is.
     """
 
-    def __init__(
-        self,
-        library: Any,
-        session: Any,
-        loop: asyncio.AbstractEventLoop,
-        stale: Callable[[], bool] = lambda: False,
-    ) -> None:
+    def __init__(self, library: Any, session: Any, config: ZenohConfig, settings: Settings | None) -> None:
         self._zenoh = library
         self._session = session
-        self._loop = loop
+        self._config = config
+        self._stamp = config.stamp()
+        self._settings = settings
+        # The event loop in which all callbacks are called.
+        self._loop = loop = asyncio.get_running_loop()
         self.zid = str(session.zid())
         self._arrivals = Arrivals(loop)
         self._declarations = SerialWorker("zenoh declarations")
@@ -123,12 +237,12 @@ class OpenSession:
         self._lanes: dict[ZenohPriority, SendingLane] = {}
         self._publishers: set[QueuedPublisher] = set()
         self._kept: set[Declaration] = set()
-        self._stale = stale
         self._closing = False
         self._closed = False
         self._flushed = asyncio.Event()
-        self._tuning = SocketTuning()
-        self._looking: asyncio.TimerHandle | None = None
+        # The endpoints whose sockets are bounded.
+        self._bounded: frozenset[str] = frozenset()
+        self._looking = Delay()
         self._look_at_links()
 
     @property
@@ -137,17 +251,29 @@ class OpenSession:
         return () if self._closed else tuple(str(link.dst) for link in self._session.info.links())
 
     def _look_at_links(self) -> None:
-        self._tuning.look(self.endpoints)
-        self._looking = self._loop.call_later(_LOOK_AT_LINKS, self._look_at_links)
+        there = frozenset(self.endpoints)
+        if new := there - self._bounded:
+            bound_unsent(new)
+        self._bounded = there
+        self._looking.set(_LOOK_AT_LINKS, self._look_at_links)
 
     @property
     def stale(self) -> bool:
-        """Whether it has to be opened anew for others to connect."""
-        return self._stale()
+        """Whether it has to be opened anew for others to connect: its certificate or table of access is another.
+
+        Zenoh reads the table and the certificate of a listener once, and that of a connection each time. The table is
+        another where a module was revoked, or has joined since.
+        """
+        renewed = self._config.stamp() != self._stamp
+        if renewed or self._settings is None:
+            return renewed
+        try:
+            return session_config(self._settings).access_control != self._config.access_control
+        except StartError:
+            return False  # files are being written
 
     def publisher(self, key: str, qos: ZenohQos, on_matching: Callable[[bool], None]) -> QueuedPublisher:
         """Declare a publisher; ``on_matching(there)`` tells whether there is a subscriber, also at the beginning."""
-        self._check(key)
         last: list[bool] = []
 
         def matched(there: bool) -> None:
@@ -175,30 +301,25 @@ class OpenSession:
             return objects
 
         publisher = QueuedPublisher(self._lane(qos.priority), key, qos, undeclare)
-        declaration = Declaration(self._declarations, self._kept, declare, queue)
+        declaration = self._declare(key, declare, queue)
         self._publishers.add(publisher)
         return publisher
 
     def subscribe(
         self,
         key: str,
-        on_sample: Callable[[ZenohSample], None],
+        on_sample: Callable[[ZenohSample], object],
         *,
         history: bool = False,
     ) -> Declaration:
-        """Subscribe to a key expression; ``history``: ask publishers with a cache for what they keep."""
-        self._check(key)
-        fixed = None if _WILD.intersection(key) else key
+        """Subscribe to a key; ``history``: ask publishers with a cache for what they keep."""
         queue = ArrivalQueue(self._arrivals, on_sample, limits.ARRIVED_MESSAGES, limits.ARRIVED_BYTES)
         put = self._zenoh.SampleKind.PUT
 
         def arrived(sample: Any) -> None:
-            if sample.kind != put or not self._readable(sample.attachment):
-                return
-            name = fixed or str(sample.key_expr)
-            if fixed or self._short(name):
+            if sample.kind == put and self._readable(sample.attachment):
                 payload, attachment = content(sample.payload), content(sample.attachment)
-                queue.add(ZenohSample(name, payload, attachment), len(payload) + len(attachment))
+                queue.add(ZenohSample(payload, attachment), len(payload) + len(attachment))
 
         def declare() -> list[Any]:
             if not history:
@@ -208,16 +329,14 @@ class OpenSession:
             asked = ext.HistoryConfig(detect_late_publishers=True)
             return [ext.declare_advanced_subscriber(self._session, key, self._direct(arrived), history=asked)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     def token(self, key: str) -> Declaration:
         """Declare a liveliness token."""
-        self._check(key)
-        return Declaration(self._declarations, self._kept, lambda: [self._session.liveliness().declare_token(key)])
+        return self._declare(key, lambda: [self._session.liveliness().declare_token(key)])
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> Declaration:
         """Call ``on_token(key, alive)`` for each token that is there, and at each change."""
-        self._check(key)
         put = self._zenoh.SampleKind.PUT
         queue: ArrivalQueue[tuple[str, bool]] = ArrivalQueue(
             self._arrivals, lambda change: on_token(*change), limits.ARRIVED_TOKENS, limits.ARRIVED_TOKEN_BYTES
@@ -231,7 +350,7 @@ class OpenSession:
         def declare() -> list[Any]:
             return [self._session.liveliness().declare_subscriber(key, self._direct(arrived), history=True)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     def queryable(
         self,
@@ -240,7 +359,6 @@ class OpenSession:
         _needs: Needs | None = None,
     ) -> Declaration:
         """Answer queries."""
-        self._check(key)
         queue: ArrivalQueue[ArrivedQuery] = ArrivalQueue(
             self._arrivals,
             on_query,
@@ -263,7 +381,7 @@ class OpenSession:
         def declare() -> list[Any]:
             return [self._session.declare_queryable(key, self._direct(arrived), complete=True)]
 
-        return Declaration(self._declarations, self._kept, declare, queue)
+        return self._declare(key, declare, queue)
 
     async def get(
         self,
@@ -274,11 +392,11 @@ class OpenSession:
         timeout: float = 5.0,  # noqa: ASYNC109 - Zenoh ends the query by itself
         all_complete: bool = False,
         priority: ZenohPriority = ZenohPriority.DATA,
-    ) -> list[ZenohReply]:
+    ) -> list[ZenohSample]:
         """Ask; wait for all answers, or for ``timeout`` seconds. ``all_complete``: ask every complete queryable."""
         zenoh = self._zenoh
         self._check(selector.partition("?")[0])
-        done: asyncio.Future[list[ZenohReply]] = self._loop.create_future()
+        done: asyncio.Future[list[ZenohSample]] = self._loop.create_future()
         pending = PendingGet(done, self._arrivals)
         cancellation = zenoh.CancellationToken()
         body = payload if isinstance(payload, bytes) else bytes(payload)
@@ -316,8 +434,7 @@ class OpenSession:
         if self._closing:
             return
         self._closing = True
-        if self._looking is not None:
-            self._looking.cancel()
+        self._looking.cancel()
         if not self._publishers:
             self._flushed.set()
         for publisher in tuple(self._publishers):
@@ -332,7 +449,7 @@ class OpenSession:
     def _end(self) -> None:
         lanes = [lane.thread for lane in self._lanes.values()]
         for lane in self._lanes.values():
-            lane.stop()
+            lane.stop(discard=True)
         self._declarations.stop(discard=True)
         self._queries.stop(discard=True)
         closing = SerialWorker("zenoh session close")
@@ -376,12 +493,18 @@ class OpenSession:
         self._arrivals.refuse("zenoh.key.long")
         return False
 
+    def _declare(
+        self, key: str, declare: Callable[[], list[Any]], queue: ArrivalQueue[Any] | None = None
+    ) -> Declaration:
+        self._check(key)
+        return Declaration(self._declarations, self._kept, declare, queue)
+
     def _check(self, key: str) -> None:
         """Refuse a key that Zenoh would refuse later, in another thread."""
         try:
             self._zenoh.KeyExpr(key)
         except self._zenoh.ZError as error:
-            raise ValueError(f"{key!r} is not a key expression of Zenoh: {_reason(error)}") from None
+            raise ValueError(f"{key!r} is not a key expression of Zenoh: {reason_of(error)}") from None
 
     def _lane(self, priority: ZenohPriority) -> SendingLane:
         lane = self._lanes.get(priority)
@@ -420,12 +543,12 @@ class OpenSession:
         )
 
 
-async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda: False) -> OpenSession:
+async def open_session(config: ZenohConfig, settings: Settings | None = None) -> OpenSession:
     """Open a session, in a thread.
 
     Args:
         config: Its mode, endpoints and certificates.
-        changed: Whether it would be another one now (``OpenSession.stale``).
+        settings: What that was made of (``OpenSession.stale``).
 
     Raises:
         StartError: The library is missing, an address is taken, or the endpoints do not answer.
@@ -436,49 +559,14 @@ async def open_session(config: ZenohConfig, changed: Callable[[], bool] = lambda
         raise StartError(
             "zenoh", "eclipse-zenoh is not installed", missing_extra("zenoh"), code="extra-missing"
         ) from None
-    settings = zenoh.Config()
+    terms = zenoh.Config()
     try:
         for key, value in config.entries().items():
-            settings.insert_json5(key, json.dumps(value))
-        session = await in_thread(lambda: zenoh.open(settings), "zenoh open")
+            terms.insert_json5(key, json.dumps(value))
+        session = await in_thread(lambda: zenoh.open(terms), "zenoh open")
     except zenoh.ZError as error:
-        raise _start_error(config, _reason(error)) from None
-    files = config.certificates if config.listen else None
-    certificate = Path(files.certificate) if files is not None else None
-    stamp = _stamp(certificate)
-
-    def stale() -> bool:
-        return _stamp(certificate) != stamp or changed()
-
-    return OpenSession(zenoh, session, asyncio.get_running_loop(), stale)
-
-
-def _stamp(file: Path | None) -> tuple[int, int] | None:
-    """What changes when a file is replaced; ``None`` for none, and for one that cannot be seen."""
-    try:
-        info = file.stat() if file is not None else None
-    except OSError:
-        return None
-    return (info.st_ino, info.st_mtime_ns) if info is not None else None
-
-
-def _reason(error: Exception) -> str:
-    """The text of an error of Zenoh without the places in Zenoh's source."""
-    text = str(error).strip()
-    while (at := text.rfind(" at /")) > 0:
-        text = text[:at].rstrip(" .;[")
-    return text
-
-
-def _start_error(config: ZenohConfig, reason: str) -> StartError:
-    where = ", ".join((*config.connect, *config.listen)) or "its default endpoints"
-    if "listener" in reason or "in use" in reason:
-        remedy = "choose another --listen, or stop the program that listens there"
-    elif "certificate" in reason.lower() or "tls" in reason.lower():
-        remedy = "both sides need certificates of the same mesh: see rmpa trust status"
-    else:
-        remedy = "start the router there, or correct --connect"
-    return StartError(f"zenoh {where}", reason, remedy)
+        raise config.start_error(reason_of(error)) from None
+    return OpenSession(zenoh, session, config, settings)
 
 
 async def open_trusted_session(settings: Settings) -> OpenSession:
@@ -487,13 +575,4 @@ async def open_trusted_session(settings: Settings) -> OpenSession:
     Raises:
         StartError: It may not be opened without certificates, an address is taken, or no router answers.
     """
-    config = session_config(settings)
-
-    def changed() -> bool:
-        """Whether the table of access would be another one now: a module was revoked, or has joined since."""
-        try:
-            return session_config(settings).access_control != config.access_control
-        except StartError:
-            return False  # files are being written
-
-    return await open_session(config, changed)
+    return await open_session(session_config(settings), settings)

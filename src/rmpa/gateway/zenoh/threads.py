@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import queue
 import threading
 import time
 from collections import Counter, deque
@@ -21,13 +22,13 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from rmpa.core.contract import Priority
 from rmpa.gateway import limits
+from rmpa.runtime.loop import Delay
 from rmpa.runtime.stream import CollectedSends
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from rmpa.ros.wire.tcpros import Buffer
 
 _log = logging.getLogger(__name__)
 
@@ -85,34 +86,17 @@ class ZenohQos:
 
 @dataclass(frozen=True, slots=True)
 class ZenohSample:
-    """One message that was received.
+    """One message that was received, or one answer to ``get``.
 
     Args:
-        key: Its key.
-        payload: Its bytes.
+        payload: Its bytes; of an error its text in UTF-8.
         attachment: Its attachment; empty if it has none.
+        ok: Whether it is no error.
     """
 
-    key: str
     payload: bytes
-    attachment: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ZenohReply:
-    """One answer to ``get``.
-
-    Args:
-        key: The key that was answered; empty for an error.
-        payload: The answer, or the error's text in UTF-8.
-        attachment: Its attachment; empty if it has none.
-        ok: Whether it is an answer and no error.
-    """
-
-    key: str
-    payload: bytes
-    attachment: bytes
-    ok: bool
+    attachment: bytes = b""
+    ok: bool = True
 
     @property
     def text(self) -> str:
@@ -120,9 +104,15 @@ class ZenohReply:
         return self.payload.decode(errors="replace")
 
 
-def first_answer(replies: Sequence[ZenohReply]) -> ZenohReply | None:
+def first_answer(replies: Sequence[ZenohSample]) -> ZenohSample | None:
     """The first answer, or the first error if there is none; ``None``: nothing answered."""
     return min(replies, key=lambda each: not each.ok, default=None)
+
+
+def call_loop(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
+    """Call a function in the event loop, from any thread, if the loop still runs."""
+    with contextlib.suppress(RuntimeError):  # it was closed before the session
+        loop.call_soon_threadsafe(function)
 
 
 _threads = threading.local()
@@ -267,7 +257,7 @@ class Arrivals:
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
+        self.loop: Final = loop
         self.lock = threading.Lock()
         self.refused: Counter[str] = Counter()
         self._ready: deque[ArrivalQueue[object]] = deque()
@@ -277,11 +267,6 @@ class Arrivals:
         self._in_window = 0
         # What waits in memory for Zenoh to take it; guarded by ``lock``.
         self._answers = self._answer_bytes = 0
-
-    def call(self, function: Callable[[], None]) -> None:
-        """Call a function in the loop, from any thread."""
-        with contextlib.suppress(RuntimeError):  # the loop was closed before the session
-            self._loop.call_soon_threadsafe(function)
 
     def take_room(self, size: int) -> bool:
         """Reserve room for an answer of ``size`` bytes; one alone always has it.
@@ -318,7 +303,7 @@ class Arrivals:
         if not self._woken and not self._closed:
             self._woken = True
             try:
-                self._loop.call_soon_threadsafe(self._drain)
+                self.loop.call_soon_threadsafe(self._drain)
             except RuntimeError:  # the loop was closed before the session
                 self._closed = True
 
@@ -330,7 +315,7 @@ class Arrivals:
 
     def _drain(self) -> None:
         taken = self._deliver()
-        now = self._loop.time()
+        now = self.loop.time()
         if now >= self._window_end:
             self._window_end = now + limits.BUSY_PERIOD
             self._in_window = 0
@@ -339,11 +324,11 @@ class Arrivals:
             if self._closed:
                 return
             if self._ready and taken >= _DRAIN_MESSAGES:
-                self._loop.call_soon(self._drain)
+                self.loop.call_soon(self._drain)
             elif self._in_window >= _BUSY_MESSAGES:
-                self._loop.call_later(limits.BUSY_PERIOD, self._drain)
+                self.loop.call_later(limits.BUSY_PERIOD, self._drain)
             elif self._ready:
-                self._loop.call_soon(self._drain)
+                self.loop.call_soon(self._drain)
             else:
                 self._woken = False
 
@@ -365,11 +350,91 @@ class Arrivals:
         return _DRAIN_MESSAGES - messages
 
 
-# Publishers behind bounded queues, and the threads that put their messages to Zenoh. A put of a reliable publisher
-# waits while the transport's queue of its priority is full: Zenoh has one such queue for each priority. So each
-# priority in use has one thread here, and within it the publishers take turns. What waits for a full bulk lane holds
-# no command up, and nothing holds the event loop up. Behind a full transport the oldest messages of each publisher
-# are dropped, and counted.
+# What waits for Zenoh: a put of a reliable publisher waits while the transport's queue of its priority is full, and
+# so do declarations, queries and replies. Zenoh has one such queue for each priority, so each priority in use has one
+# thread here, and within it the publishers take turns. What waits for a full bulk lane holds no command up, and
+# nothing holds the event loop up. Behind a full transport the oldest messages of each publisher are dropped, and
+# counted.
+
+
+class SerialWorker:
+    """Runs functions one after the other in a daemon thread, in the order in which they were given.
+
+    Args:
+        name: The thread's name.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
+        self._discard = False
+        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.thread.start()
+
+    def submit(self, job: Callable[[], object]) -> None:
+        """Run ``job`` after all that was given before; its errors are logged."""
+        self._jobs.put(job)
+
+    def stop(self, *, discard: bool = False) -> None:
+        """End the thread once all that was given has run.
+
+        Args:
+            discard: What has not begun is not run.
+        """
+        self._discard = discard
+        self._jobs.put(None)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                if not self._discard:
+                    job()
+            except Exception as error:  # noqa: BLE001 - one declaration that fails must not stop the others
+                if not self._discard:
+                    _log.warning("! zenoh: %s [zenoh-trouble]", error)
+            del job
+
+
+class SendingLane(SerialWorker):
+    """The thread that puts the messages of one priority; its jobs are the turns of publishers.
+
+    Args:
+        loop: The event loop that the publishers belong to.
+        name: The thread's name.
+        failures: The exceptions of Zenoh's ``put``.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, name: str, failures: tuple[type[Exception], ...]) -> None:
+        self.loop: Final = loop
+        self._failures = failures
+        self._failed = False
+        self._window_end = 0.0
+        self._in_window = 0
+        super().__init__(name)
+
+    def put(self, handle: Any, key: str, payload: bytes, attachment: bytes) -> bool:
+        """Put one message; return whether Zenoh took it. Called from the lane's thread."""
+        if self._discard:
+            return False
+        try:
+            handle.put(payload, attachment=attachment or None)
+        except self._failures as error:
+            if not self._failed:
+                self._failed = True
+                _log.warning("! zenoh: a message by %s was not sent: %s [zenoh-trouble]", key, error)
+            return False
+        return True
+
+    def rest(self, messages: int) -> None:
+        """End a turn of so many messages. Called from the lane's thread.
+
+        Above ``_BUSY_MESSAGES`` the loop need not wake this thread, nor wait for the interpreter's lock, for each.
+        """
+        now = time.monotonic()
+        if now >= self._window_end:
+            self._window_end, self._in_window = now + limits.BUSY_PERIOD, 0
+        self._in_window += messages
+        if self._in_window >= _BUSY_MESSAGES and self._jobs.empty():
+            time.sleep(limits.BUSY_PERIOD / 2)
 
 
 class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
@@ -388,12 +453,13 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
     def __init__(self, lane: SendingLane, key: str, qos: ZenohQos, undeclare: Callable[[], None]) -> None:
         super().__init__(qos.messages, qos.bytes)
         self._lane = lane
+        self._lock = threading.Lock()
         self.key: Final = key
         self._undeclare = undeclare
         self.handle: Any = None
         self._taken = 0
         self._scheduled = False
-        self._flush_timer: asyncio.TimerHandle | None = None
+        self._flushing = Delay()
         self._closed = False
         self.sent = 0
 
@@ -402,31 +468,25 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         """Messages in the queue, with those whose turn it is."""
         return len(self._items) + self._taken
 
-    def put(self, payload: Buffer, attachment: bytes = b"") -> int:
-        """Queue one message; the payload is copied if it is not ``bytes``. Returns the messages dropped for it."""
-        return self.put_all(((payload if isinstance(payload, bytes) else bytes(payload), attachment),))
-
-    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
-        """Queue messages, each with its attachment, in order; returns the messages dropped for them."""
-        with self._lane.changed:
+    def put_all(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Queue messages, each with its attachment, in order."""
+        with self._lock:
             if self._closed:
                 self.dropped += len(messages)
-                return len(messages)
-            before = self.dropped
+                return
             for message in messages:
                 self.push(message, len(message[0]), self._taken)
             self._schedule()
-            return self.dropped - before
 
     def declared(self, handle: Any) -> None:
         """Begin to send: Zenoh's publisher is there. Called from the thread that declares."""
-        with self._lane.changed:
+        with self._lock:
             self.handle = handle
             self._schedule()
 
     def close(self) -> None:
         """Undeclare it, after the queue is empty or a second has passed."""
-        with self._lane.changed:
+        with self._lock:
             if self._closed:
                 return
             self._closed = True
@@ -434,123 +494,41 @@ class QueuedPublisher(BoundedQueue[tuple[bytes, bytes]]):
         if empty:
             self._undeclare()
         else:
-            self._flush_timer = self._lane.loop.call_later(limits.FLUSH_MAX, self._give_up)
+            self._flushing.set(limits.FLUSH_MAX, self._give_up)
 
-    def begin_turn(self) -> list[tuple[bytes, bytes]]:
-        """Take the messages of one turn. The caller has the lane's lock."""
-        turn, _ = self.take_turn()
-        self._taken = len(turn)
-        return turn
+    def _schedule(self) -> None:
+        """Take a turn soon, if something waits. The caller has the lock."""
+        if self._items and not self._scheduled and self.handle is not None:
+            self._scheduled = True
+            self._lane.submit(self._turn)
 
-    def send(self, turn: list[tuple[bytes, bytes]]) -> None:
-        """Put the messages of one turn, and count them. Called from the lane's thread, without its lock."""
+    def _turn(self) -> None:
+        """Put the messages of one turn, and count them. Called from the lane's thread."""
+        with self._lock:
+            turn, _ = self.take_turn()
+            self._taken = len(turn)
         for payload, attachment in turn:
             sent = self._lane.put(self.handle, self.key, payload, attachment)
             self._taken -= 1
             if sent:
                 self.sent += 1
             else:
-                with self._lane.changed:
+                with self._lock:
                     self.dropped += 1
-
-    def end_turn(self) -> None:
-        """Queue up for another turn, or end. The caller has the lane's lock."""
-        self._taken = 0
-        self._scheduled = False
-        if self._items:
+        with self._lock:
+            self._scheduled = False
             self._schedule()
-        elif self._closed:
-            self._lane.call_loop(self._flushed)
-
-    def _schedule(self) -> None:
-        if self._items and not self._scheduled and self.handle is not None:
-            self._scheduled = True
-            self._lane.schedule(self)
+            ended = self._closed and not self._items
+        if ended:
+            call_loop(self._lane.loop, self._flushed)
+        self._lane.rest(len(turn))
 
     def _flushed(self) -> None:
-        if self._flush_timer is not None:
-            self._flush_timer.cancel()
-            self._flush_timer = None
+        if self._flushing:
+            self._flushing.cancel()
             self._undeclare()
 
     def _give_up(self) -> None:
-        with self._lane.changed:
+        with self._lock:
             self.dropped += len(self.clear())
-        self._flushed()
-
-
-class SendingLane:
-    """The thread that puts the messages of one priority.
-
-    Args:
-        loop: The event loop that the publishers belong to.
-        name: The thread's name.
-        failures: The exceptions of Zenoh's ``put``.
-
-    Attributes:
-        changed: Guards the queues of all publishers of this lane.
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, name: str, failures: tuple[type[Exception], ...]) -> None:
-        self.loop: Final = loop
-        self._failures = failures
-        self.changed: Final = threading.Condition(threading.Lock())
-        self._ready: deque[QueuedPublisher] = deque()
-        self._stopped = False
-        self._failed = False
-        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self.thread.start()
-
-    def schedule(self, publisher: QueuedPublisher) -> None:
-        """Give a publisher its turn. The caller has the lock."""
-        self._ready.append(publisher)
-        if len(self._ready) == 1:
-            self.changed.notify()
-
-    def call_loop(self, function: Callable[[], None]) -> None:
-        """Call ``function`` in the event loop, if it still runs."""
-        try:
-            self.loop.call_soon_threadsafe(function)
-        except RuntimeError:  # the loop was closed before the session
-            self._stopped = True
-
-    def stop(self) -> None:
-        """End the thread after the put that is under way."""
-        with self.changed:
-            self._stopped = True
-            self.changed.notify()
-
-    def _run(self) -> None:
-        window_end, in_window = 0.0, 0
-        while True:
-            if in_window >= _BUSY_MESSAGES and not self._ready:
-                # The loop need not wake this thread, nor wait for the interpreter's lock, for each message.
-                time.sleep(limits.BUSY_PERIOD / 2)
-            with self.changed:
-                while not self._ready and not self._stopped:
-                    self.changed.wait()
-                if self._stopped:
-                    return
-                publisher = self._ready.popleft()
-                turn = publisher.begin_turn()
-            publisher.send(turn)
-            now = time.monotonic()
-            if now >= window_end:
-                window_end, in_window = now + limits.BUSY_PERIOD, 0
-            in_window += len(turn)
-            del turn
-            with self.changed:
-                publisher.end_turn()
-
-    def put(self, handle: Any, key: str, payload: bytes, attachment: bytes) -> bool:
-        """Put one message; return whether Zenoh took it. Called from the lane's thread."""
-        if self._stopped or handle is None:
-            return False
-        try:
-            handle.put(payload, attachment=attachment or None)
-        except self._failures as error:
-            if not self._failed:
-                self._failed = True
-                _log.warning("! zenoh: a message by %s was not sent: %s [zenoh-trouble]", key, error)
-            return False
-        return True
+        self._undeclare()

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.gateway.ros2.conversion import ActionPair
 from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, data_key
+from rmpa.gateway.ros2.pairs import ActionPair
 from rmpa.gateway.ros2.types import Ros2Types, TypePair
 from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SitesReport
 from rmpa.ros.types.definitions import SEPARATOR, known_text

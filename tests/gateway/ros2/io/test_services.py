@@ -14,7 +14,7 @@ from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment
 from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.rules import SourceKind
-from rmpa.gateway.zenoh.threads import ZenohReply
+from rmpa.gateway.zenoh.threads import ZenohSample
 from rmpa.ros.types.definitions import known_text
 from rmpa.ros.types.installed import ServiceType
 from tests.gateway.memory_graph import MemoryService
@@ -49,7 +49,7 @@ def servers(bed: Ros2Bed) -> list[str]:
 
 async def call(
     bed: Ros2Bed, request: bytes | None = None, attachment: bytes | None = None, **values: int
-) -> ZenohReply:
+) -> ZenohSample:
     """A call of /add by a client of ROS 2."""
     client = bed.endpoint(EntityKind.CLIENT, "/add", ADD_2)
     attached = Ros2Attachment(7, 1000, gid_of("a token")).serialize() if attachment is None else attachment

@@ -312,7 +312,7 @@ async def test_rules_decide_what_crosses_and_its_name() -> None:
         await eventually(lambda: bed.graph.taps)
         for _ in range(50):
             bed.graph.send(sources["/out"], string("x"))
-        ((export, _),) = bed.neighbour.topics.exports()
+        (export,) = bed.neighbour.topics.exports()
         assert export.messages + export.limited == 50
         assert export.limited >= 40, "its rate is kept, and counted"
 

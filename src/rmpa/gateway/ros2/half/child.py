@@ -21,8 +21,7 @@ To the gateway:
 
 ``H``  JSON: ``protocol``, ``distribution``, ``rmw``, ``python``, ``gids`` (whether messages tell their publisher),
        ``prefix`` (of the GIDs of this process)
-``+``  an endpoint was created: JSON ``{"gid"}``
-``!``  it was not, or its QoS fits no other one: JSON ``{"text"}``
+``!``  an endpoint was not created, or its QoS fits no other one: JSON ``{"text"}``
 ``G``  the graph: JSON ``{"nodes": [...], "added": [...], "removed": [...]}``
 ``M``  a message: length of the GID (1 byte), the GID, source stamp (8), sequence number (8), then CDR
 ``Q``  a request: the number of the call, 8 bytes, and CDR
@@ -40,13 +39,14 @@ import struct
 import sys
 import threading
 import time
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .branches import distribution, event_callbacks, handle_of, look_at_events
-from .graph import Watcher, read_qos
-from .taker import Taker, ignore
-from .waits import GraphGuard, Waits
+from .branches import GraphGuard, Taker, Waits, distribution, event_callbacks, handle_of, ignore, look_at_events
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 PROTOCOL = 1
 _HEAD = struct.Struct("<IBI")
@@ -57,6 +57,26 @@ _SHORT = 5
 _OWN = "/rmpa/"
 # Messages of which it is known that their echo has not come; for rclpys that do not tell a message's publisher.
 _ECHOES = 10000
+# Seconds between two looks at the endpoints of every topic, whatever is told.
+_WHOLE_PERIOD = 5.0
+# Seconds between two looks at names where no change is told, and between two looks at the least.
+_POLL_PERIOD = 0.25
+_LEAST_PERIOD = 0.05
+# The names of the node of an endpoint that has none, or of which it is not known yet (rmw_dds_common).
+_NAMELESS = ("_NODE_NAME_UNKNOWN_", "_CREATED_BY_BARE_DDS_APP_")
+# Seconds within which that is known: twice the period at which DDS repeats what was lost.
+_NAMING_PERIOD = 6.0
+# Hexadecimal digits of a GID that the participant of DDS has.
+_PARTICIPANT = 24
+_INFINITE = 2**63 - 1
+# What a QoS is made of, beside its depth, by the names of the gateway: the enumerations and times of rclpy.
+_POLICIES = {
+    "reliability": "ReliabilityPolicy",
+    "durability": "DurabilityPolicy",
+    "history": "HistoryPolicy",
+    "liveliness": "LivelinessPolicy",
+}
+_TIMES = {"deadline": "deadline", "lifespan": "lifespan", "lease": "liveliness_lease_duration"}
 
 
 class Pipe:
@@ -98,6 +118,136 @@ class Pipe:
         return data
 
 
+class Watcher:
+    """Looks at what ROS 2 has, when something has changed, or again and again where nothing tells of that."""
+
+    def __init__(self, node: Any, say: Callable[..., None]) -> None:
+        self._node = node
+        self._say = say
+        self._names: Any = None
+        self._known: dict[str, dict[str, Any]] = {}
+        self._nodes: Any = None
+        # When an endpoint without a node was seen first, by GID.
+        self._nameless: dict[str, float] = {}
+        self._looked = self._whole = self._earliest = 0.0
+
+    def due(self, *, told: bool, changed: bool) -> float:
+        """When to look next, by the steady clock; ``told``: a change is told, and one was."""
+        period = _WHOLE_PERIOD if told else _POLL_PERIOD
+        return self._earliest if changed else self._looked + period
+
+    def look(self, now: float, *, changed: bool) -> bool:
+        """Tell the gateway what has changed; return whether to look again soon."""
+        node = self._node
+        nodes = sorted(set(node.get_node_names_and_namespaces()))
+        topics = sorted(name for name, _ in node.get_topic_names_and_types())
+        names = nodes, topics, sorted(name for name, _ in node.get_service_names_and_types())
+        self._looked, again = now, False
+        if changed or names != self._names or now >= self._whole + _WHOLE_PERIOD:
+            self._names, self._whole = names, now
+            again = self._compare(nodes, topics)
+        # Looking takes a tenth of the time at the most.
+        self._earliest = now + max(_LEAST_PERIOD, 10 * (time.monotonic() - now))
+        return again
+
+    def _compare(self, nodes: list[tuple[str, str]], topics: list[str]) -> bool:
+        found = {row["gid"]: row for name in topics for row in self._endpoints(name)}
+        again = found.pop("", None) is not None
+        shown = []
+        for base, namespace in nodes:
+            try:
+                services = self._node.get_service_names_and_types_by_node(base, namespace)
+            except Exception:  # the node has just gone
+                continue
+            owner = namespace.rstrip("/") + "/" + base
+            shown.append(owner)
+            for name, types in services:
+                for kind_of in types:
+                    key = "%s %s %s" % (owner, name, kind_of)
+                    found[key] = _told(key, "SS", owner, name, kind_of, _service_hash(kind_of), {})
+        added = [each for key, each in found.items() if key not in self._known]
+        removed = [key for key in self._known if key not in found]
+        if not again:
+            self._nameless.clear()
+        self._known = found
+        if added or removed or shown != self._nodes:
+            self._nodes = shown
+            self._say("G", 0, nodes=shown, added=added, removed=removed)
+        return again
+
+    def _endpoints(self, name: str) -> Iterator[dict[str, Any]]:
+        """Those of a topic; one without a GID stands for those of which the node is not known yet."""
+        for kind, infos in (
+            ("MP", self._node.get_publishers_info_by_topic(name)),
+            ("MS", self._node.get_subscriptions_info_by_topic(name)),
+        ):
+            for info in infos:
+                gid = bytes(info.endpoint_gid).hex()
+                if gid in self._known:
+                    yield self._known[gid]
+                    continue
+                owner = info.node_namespace.rstrip("/") + "/" + info.node_name
+                if info.node_name.startswith(_NAMELESS):
+                    # Programs of plain DDS have no node; what names that of others may be late by seconds.
+                    if time.monotonic() < self._nameless.setdefault(gid, time.monotonic()) + _NAMING_PERIOD:
+                        yield {"gid": ""}
+                        continue
+                    owner = "/dds_" + gid[_PARTICIPANT - 8 : _PARTICIPANT]
+                type_hash = str(getattr(info, "topic_type_hash", "") or "")
+                yield _told(gid, kind, owner, name, info.topic_type, type_hash, _told_qos(info.qos_profile))
+
+
+def _told(gid: str, kind: str, node: str, name: str, kind_of: str, type_hash: str, qos: Any) -> dict[str, Any]:
+    return {"gid": gid, "kind": kind, "node": node, "name": name, "type": kind_of, "hash": type_hash, "qos": qos}
+
+
+def _told_qos(profile: Any) -> dict[str, int]:
+    """A QoS for the gateway: the numbers of rmw/types.h, times in nanoseconds."""
+    told = {name: int(getattr(profile, name)) for name in _POLICIES}
+    if profile.depth:
+        told["depth"] = profile.depth
+    for name, attribute in _TIMES.items():
+        value = getattr(profile, attribute).nanoseconds
+        if 0 < value < _INFINITE:
+            told[name] = value
+    return told
+
+
+_HASHES: dict[str, str] = {}
+
+
+def _service_hash(name: str) -> str:
+    """The hash of a service type, from the description that its package has installed; empty: there is none."""
+    if name not in _HASHES:
+        _HASHES[name] = ""
+        package, kind, base = name.split("/")
+        file_name = (base.rpartition("_")[0] if kind == "action" else base) + ".json"
+        try:
+            folder = os.path.dirname(importlib.import_module(package).__file__ or "")
+            while not os.path.isdir(os.path.join(folder, "share", package)):
+                if folder == os.path.dirname(folder):
+                    return ""
+                folder = os.path.dirname(folder)
+            with open(os.path.join(folder, "share", package, kind, file_name)) as file:
+                for each in json.load(file)["type_hashes"]:
+                    if each["type_name"] == name:
+                        _HASHES[name] = each["hash_string"]
+        except (ImportError, OSError, ValueError, KeyError):  # before Iron, or a package that is not installed here
+            pass
+    return _HASHES[name]
+
+
+def read_qos(given: dict[str, int]) -> Any:
+    """The QoS as the gateway writes it: what differs from rmw's defaults, in the form of ``_told_qos``."""
+    from rclpy import qos
+    from rclpy.duration import Duration
+
+    fields: dict[str, Any] = {"depth": given.get("depth", 10)}
+    fields.update((name, getattr(qos, kind)(given[name])) for name, kind in _POLICIES.items() if name in given)
+    fields.update((key, Duration(nanoseconds=given[name])) for name, key in _TIMES.items() if name in given)
+    return qos.QoSProfile(**fields)
+
+
 def load_type(name: str) -> Any:
     """The class of ``package/msg/Name``, ``package/srv/Name``, or a part of an action as ROS 2 names it.
 
@@ -123,19 +273,22 @@ def load_type(name: str) -> Any:
         raise LookupError("the package %s of ROS 2 has no %s here: it is older or newer" % (package, name))
 
 
+@dataclass(eq=False)
 class Made:
-    """One publisher, subscription, server or client that was made for the gateway."""
+    """One publisher, subscription, server or client that was made for the gateway.
 
-    def __init__(self, number: int, kind: str, name: str, node: Any, entity: Any, handle: Any, kind_of: Any) -> None:
-        self.number = number
-        self.kind = kind
-        self.name = name
-        self.node = node
-        self.entity = entity
-        self.handle = handle
-        self.type = kind_of
-        # Of a server: the header of each call that waits; of a client: the calls by rcl's numbers.
-        self.calls: dict[int, Any] = {}
+    Attributes:
+        calls: Of a server the header of each call that waits; of a client the calls by rcl's numbers.
+    """
+
+    number: int
+    kind: str
+    name: str
+    node: str
+    entity: Any
+    handle: Any
+    type: Any
+    calls: dict[int, Any] = field(default_factory=dict)
 
 
 class Half:
@@ -164,6 +317,13 @@ class Half:
         self._graph = Watcher(self._own, link.say)
         self._guard = GraphGuard(self._own)
         self._requests = 0
+        self._operations = {
+            "+": self._create,
+            "-": self._destroy,
+            "M": self._publish,
+            "Q": self._call,
+            "A": self._answer,
+        }
         # Messages of our own that have not come back yet, by topic and hash.
         self._echoes: collections.Counter[tuple[str, int]] = collections.Counter()
 
@@ -209,16 +369,7 @@ class Half:
                 raise
 
     def _do(self, operation: str, number: int, body: bytes) -> None:
-        if operation == "M":
-            self._publish(number, body)
-        elif operation == "+":
-            self._create(number, json.loads(body))
-        elif operation == "-":
-            self._destroy(number)
-        elif operation == "Q":
-            self._call(number, body)
-        elif operation == "A":
-            self._answer(number, body)
+        self._operations[operation](number, body)
         with self._lock:
             self._waiting[number] -= 1
             if not self._waiting[number]:
@@ -229,7 +380,8 @@ class Half:
         options = {"start_parameter_services": False, "enable_rosout": False}
         return self._rclpy.create_node(base, context=self._context, namespace=namespace or "/", **options)
 
-    def _create(self, number: int, asked: dict[str, Any]) -> None:
+    def _create(self, number: int, body: bytes) -> None:
+        asked = json.loads(body)
         name, kind = asked["node"], asked["kind"]
         try:
             kind_of = load_type(asked["type"])
@@ -255,9 +407,8 @@ class Half:
             return
         users.append(number)
         handle = handle_of(self._native, entity)
-        self._endpoints[number] = Made(number, kind, asked["name"], node, entity, handle, kind_of)
+        self._endpoints[number] = Made(number, kind, asked["name"], name, entity, handle, kind_of)
         self._waits = None
-        self._link.say("+", number)
 
     def _events(self, number: int, publishes: bool) -> Any:
         """Callbacks that tell of a QoS that fits no other endpoint."""
@@ -269,12 +420,12 @@ class Half:
 
         return event_callbacks(publishes, incompatible)
 
-    def _destroy(self, number: int) -> None:
+    def _destroy(self, number: int, _body: bytes) -> None:
         endpoint = self._endpoints.pop(number, None)
         if endpoint is None:
             return
         self._waits = None
-        node = endpoint.node
+        node, users = self._nodes[endpoint.node]
         destroy = {
             "MP": node.destroy_publisher,
             "MS": node.destroy_subscription,
@@ -282,12 +433,10 @@ class Half:
             "SC": node.destroy_client,
         }
         destroy[endpoint.kind](endpoint.entity)
-        for name, (each, users) in list(self._nodes.items()):
-            if each is node:
-                users.remove(number)
-                if not users:
-                    del self._nodes[name]
-                    node.destroy_node()
+        users.remove(number)
+        if not users:
+            del self._nodes[endpoint.node]
+            node.destroy_node()
 
     def _call(self, number: int, body: bytes) -> None:
         from rclpy.serialization import deserialize_message
