@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from rmpa.web import limits
 from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
-from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
+from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, frame_header
+from rmpa.web.server.access import MaskCheck
 from rmpa.web.hub.node_link import READ_ONLY
 from tests.waiting import DEADLINE, until
 

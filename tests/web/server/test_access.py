@@ -29,9 +29,8 @@ from rmpa.web.rosbridge import session as rosbridge
 from rmpa.web.rosbridge.rosapi import SERVICES
 from rmpa.web.server.access import (
     AccessPolicy,
-    AccessRefused,
+    Problem,
     RequestFacts,
-    Verdict,
     is_loopback,
     own_names,
     token_from,
@@ -48,8 +47,12 @@ CLOSED = AccessPolicy(8480, HOSTS, TOKEN)
 HERE = ("base.local:8480",)
 
 
-def reason(verdict: Verdict) -> str:
-    return verdict.reason if isinstance(verdict, AccessRefused) else verdict
+def judged(policy: AccessPolicy, **facts: Any) -> str:
+    """The verdict, or why there is none."""
+    try:
+        return policy.judge(RequestFacts(**{"host": HERE, **facts}))
+    except Problem as problem:
+        return problem.reason
 
 
 LISTED = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
@@ -104,15 +107,15 @@ WITH_TOKEN: list[Any] = [
 
 @pytest.mark.parametrize(("given", "expected"), WITHOUT_TOKEN)
 def test_who_may_ask_where_there_is_no_token(given: dict[str, Any], expected: str) -> None:
-    assert reason(OPEN.judge(RequestFacts(**{"host": HERE, **given}))) == expected
+    assert judged(OPEN, **given) == expected
     # The right token does not help: a rebound page would have the browser send the cookie.
     for token in ({"authorization": f"Bearer {TOKEN}"}, {"cookie": TOKEN}):
-        assert reason(CLOSED.judge(RequestFacts(**{"host": HERE, **token, **given}))) == expected
+        assert judged(CLOSED, **token | given) == expected
 
 
 @pytest.mark.parametrize(("given", "expected"), WITH_TOKEN)
 def test_who_may_ask_where_there_is_a_token(given: dict[str, Any], expected: str) -> None:
-    assert reason(LISTED.judge(RequestFacts(**{"host": HERE, **given}))) == expected
+    assert judged(LISTED, **given) == expected
 
 
 def test_a_refusal_says_what_to_do() -> None:
@@ -122,9 +125,9 @@ def test_a_refusal_says_what_to_do() -> None:
         (RequestFacts(HERE), "Authorization: Bearer TOKEN"),
         (RequestFacts(HERE, cookie="old"), "the token is wrong"),
     ):
-        verdict = CLOSED.judge(facts)
-        assert isinstance(verdict, AccessRefused)
-        assert remedy in verdict.detail
+        with pytest.raises(Problem) as refused:
+            CLOSED.judge(facts)
+        assert remedy in refused.value.detail
 
 
 def test_only_loopback_needs_no_token() -> None:

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.monitor import Monitor
-    from rmpa.web.server.access import GuardedConnection
 
 
 _log = logging.getLogger(__name__)
@@ -131,13 +130,8 @@ class WebSocketClients:
             )
         return found
 
-    async def handle(self, request: web.Request, guard: GuardedConnection | None = None) -> web.StreamResponse:
-        """Serve one client until it has gone.
-
-        Args:
-            request: Asks for the WebSocket.
-            guard: What guards its connection; ``None``: nothing does.
-        """
+    async def handle(self, request: web.Request) -> web.StreamResponse:
+        """Serve one client, whose request asks for the WebSocket, until it has gone."""
         lines = request.headers.getall("Sec-WebSocket-Protocol", ())
         offered = [name.strip() for name in ",".join(lines).split(",") if name.strip()]
         address = request.remote or "?"
@@ -146,7 +140,7 @@ class WebSocketClients:
                 return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
             await self._monitor.mesh.first()
             page = MonitorSession(self._hub, self._rights, self._priority, address, self._monitor)
-            return await self._serve(request, guard, page, page.frame_max)
+            return await self._serve(request, page, page.frame_max)
         chosen = next((name for name in offered if name in self._protocols), None if offered else "")
         if chosen is None:
             spoken = f"{', '.join(filter(None, self._protocols))}, and rosbridge without a subprotocol"
@@ -155,15 +149,13 @@ class WebSocketClients:
         session = self._protocols[chosen](self._hub, self._rights, self._priority, address)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         most = session.frame_max if self._rights.control else foxglove_limits.TEXT_MAX
-        return await self._serve(request, guard, session, most)
+        return await self._serve(request, session, most)
 
     def _refuse_protocol(self, address: str, text: str) -> web.Response:
         self.refuse(address, "handshake", text)
         return web.Response(status=400, text=f"{text}\n")
 
-    async def _serve(
-        self, request: web.Request, guard: GuardedConnection | None, session: Session, most: int
-    ) -> web.StreamResponse:
+    async def _serve(self, request: web.Request, session: Session, most: int) -> web.StreamResponse:
         response = FrameSocket(
             protocols=(*filter(None, self._protocols), SUBPROTOCOL),
             autoping=False,
@@ -174,7 +166,7 @@ class WebSocketClients:
         self._open[session] = response
         try:
             refused = functools.partial(self._refuse_client, session)
-            await session.connection.run(request, response, guard, refused)
+            await session.connection.run(request, response, refused)
         except PeerRefused as error:
             self.refuse(session.address, "clients", str(error))
             return web.Response(status=503, text=f"{error}\n")

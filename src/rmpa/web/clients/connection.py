@@ -27,6 +27,7 @@ from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
 from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
 from rmpa.web.hub.hub import HubClient
+from rmpa.web.server.access import guard_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -327,7 +328,6 @@ class ClientConnection:
         self,
         request: web.Request,
         socket_: FrameSocket,
-        guard: GuardedConnection | None,
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -335,7 +335,6 @@ class ClientConnection:
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            guard: What guards the connection and counts what the client has sent; ``None``: nothing does.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.CLIENT_REFUSALS``.
 
         Raises:
@@ -347,9 +346,9 @@ class ClientConnection:
         tasks: list[asyncio.Task[None]] = []
         try:
             writer = await socket_.prepare(request)
-            if guard is not None:
-                guard.upgrade(self.unmasked)
-                self._guard = guard
+            self._guard = guard_of(request)
+            if self._guard is not None:
+                self._guard.upgrade(self.unmasked)
             self._arrival.message_ended(self._received)
             self._transport = request.transport
             if self._transport is None:

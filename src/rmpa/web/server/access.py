@@ -24,16 +24,19 @@ import secrets
 import stat
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias, cast
+
+import msgspec
 
 from rmpa.core.errors import StartError
 from rmpa.core.log import RefusalLog
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import MaskCheck
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
+
+    from aiohttp import web
 
     from rmpa.core.statistics import Counters
 
@@ -41,6 +44,40 @@ _log = logging.getLogger(__name__)
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
+
+_TITLES: Final = {
+    400: "Bad request",
+    401: "A token is needed",
+    403: "Refused",
+    404: "Not found",
+    405: "Method not allowed",
+    413: "Too large",
+    415: "Not an image",
+    429: "Too many at one time",
+    500: "Internal error",
+    502: "Not made",
+    503: "The agent does not answer",
+    504: "No picture",
+}
+
+
+class Problem(Exception):  # noqa: N818 - the word of RFC 9457
+    """Why a request has no result (RFC 9457).
+
+    Args:
+        status: The HTTP status.
+        detail: What happened, and what to do.
+        reason: One of ``api.REFUSALS``, by which it is counted and logged; empty: it is neither.
+    """
+
+    def __init__(self, status: int, detail: str, reason: str = "") -> None:
+        super().__init__(detail)
+        self.status, self.detail, self.reason = status, detail, reason
+
+    @property
+    def body(self) -> bytes:
+        """Its problem details, of the type ``application/problem+json``."""
+        return msgspec.json.encode({"title": _TITLES[self.status], "status": self.status, "detail": self.detail})
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,23 +113,9 @@ class RequestFacts:
     secure: bool = False
 
 
-class AccessRefused(NamedTuple):
-    """The request is not served.
-
-    Attributes:
-        reason: ``host``, ``origin`` or ``token``, for the counter.
-        status: The HTTP status.
-        detail: What happened and what to do.
-    """
-
-    reason: str
-    status: int
-    detail: str
-
-
 # ``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
 # browser is told what pages of a listed site may send.
-Verdict: TypeAlias = AccessRefused | Literal["granted", "move token", "preflight"]
+Verdict: TypeAlias = Literal["granted", "move token", "preflight"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +140,13 @@ class AccessPolicy:
         return f"rmpa_token_{self.port}"
 
     def judge(self, request: RequestFacts) -> Verdict:
-        """The decision about a request."""
-        refused = self._wrong_host(request) or self._wrong_origin(request)
-        if refused is not None:
-            return refused
+        """The decision about a request.
+
+        Raises:
+            Problem: It is not served, for its ``host``, ``origin`` or ``token``.
+        """
+        self._check_host(request)
+        self._check_origin(request)
         if request.is_preflight and self.lists(request.origin):
             return "preflight"
         return self._by_token(request)
@@ -129,35 +155,31 @@ class AccessPolicy:
         """Whether an ``Origin`` is one of ``origins``; ``*`` never is."""
         return origin is not None and origin != "*" and origin.lower() in self.origins
 
-    def _wrong_host(self, request: RequestFacts) -> AccessRefused | None:
+    def _check_host(self, request: RequestFacts) -> None:
         if len(request.host) != 1:
-            return AccessRefused("host", 400, f"the request has {len(request.host)} Host headers; send exactly one")
+            raise Problem(400, f"the request has {len(request.host)} Host headers; send exactly one", "host")
         host = request.host[0]
         name = host_name(host)
-        if name is not None and (is_address(name) or name in self.hosts):
-            return None
-        remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
-        return AccessRefused("host", 403, f"{_short(host)} is no name of this server; {remedy}")
+        if name is None or not (is_address(name) or name in self.hosts):
+            remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
+            raise Problem(403, f"{_short(host)} is no name of this server; {remedy}", "host")
 
-    def _wrong_origin(self, request: RequestFacts) -> AccessRefused | None:
+    def _check_origin(self, request: RequestFacts) -> None:
         if request.origin is not None:
             scheme, _, rest = request.origin.partition("://")
             # A page of plain HTTP may be forged on its way, so it is no page of a server of HTTPS. A server of plain
             # HTTP may be behind a proxy that ends TLS: its own pages are then of HTTPS.
             schemes = ("https",) if request.secure else ("http", "https")
-            if scheme in schemes and rest.lower() == request.host[0].lower():
-                return None
-            if self.lists(request.origin):
-                return None
-            return _foreign(_short(request.origin))
+            if not ((scheme in schemes and rest.lower() == request.host[0].lower()) or self.lists(request.origin)):
+                raise _foreign(_short(request.origin))
+            return
         elsewhere = request.fetch_site in ("cross-site", "same-site")
         # Only the token in the URL counts: a browser sends a cookie with requests of any site.
         if request.is_picture and self.token and self._fits(request.token):
-            return None
+            return
         # A link on another page may lead here: the browser shows the page, and the other page cannot read it.
         if elsewhere and not (request.fetch_mode == "navigate" and request.is_page):
-            return _foreign("another site")
-        return None
+            raise _foreign("another site")
 
     def _by_token(self, request: RequestFacts) -> Verdict:
         if not self.token or request.is_open:
@@ -170,15 +192,15 @@ class AccessPolicy:
         is_given = any(each is not None for each in (request.token, *given))
         problem = "the token is wrong" if is_given else "this server needs a token"
         remedy = "send it as Authorization: Bearer TOKEN or as ?token=TOKEN"
-        return AccessRefused("token", 401, f"{problem}; {remedy}; rmpa web says at its start where the token is")
+        raise Problem(401, f"{problem}; {remedy}; rmpa web says at its start where the token is", "token")
 
     def _fits(self, token: str | None) -> bool:
         return token is not None and hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
 
-def _foreign(whose: str) -> AccessRefused:
+def _foreign(whose: str) -> Problem:
     remedy = "open its own pages instead, or list it as origins of [web]"
-    return AccessRefused("origin", 403, f"pages of {whose} may not read from this server; {remedy}")
+    return Problem(403, f"pages of {whose} may not read from this server; {remedy}", "origin")
 
 
 def bearer(authorization: str | None) -> str | None:
@@ -302,6 +324,39 @@ class ConnectionTable:
         """Close every connection at once."""
         for connection in list(self.open):
             connection.abort()
+
+
+_MASKED: Final = 0x80
+_MASK_BYTES: Final = 4
+
+
+class MaskCheck:
+    """Finds a frame of a client that is not masked, which the library takes (RFC 6455, section 5.1)."""
+
+    def __init__(self) -> None:
+        self._header = bytearray()
+        # Bytes of the frame's payload that are still to come, its mask included.
+        self._payload = 0
+
+    def passes(self, data: bytes) -> bool:
+        """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
+        at = 0
+        while at < len(data):
+            if self._payload:
+                taken = min(self._payload, len(data) - at)
+                self._payload -= taken
+                at += taken
+                continue
+            self._header.append(data[at])
+            at += 1
+            length = self._header[1] & ~_MASKED if len(self._header) > 1 else 0
+            if len(self._header) == 2 and not self._header[1] & _MASKED:
+                return False
+            extra = {126: 2, 127: 8}.get(length, 0)
+            if len(self._header) == 2 + extra:
+                self._payload = _MASK_BYTES + (int.from_bytes(self._header[2:], "big") if extra else length)
+                self._header.clear()
+        return True
 
 
 class ConnectionPhase(Enum):
@@ -449,3 +504,9 @@ class GuardedConnection(asyncio.Protocol):
             self._timer = late(response, self.refuse, "slow_response", "it does not read the response")
         elif phase is ConnectionPhase.IDLE:
             self._timer = late(limits.WEB_IDLE_TIMEOUT, self.abort)
+
+
+def guard_of(request: web.BaseRequest) -> GuardedConnection | None:
+    """What guards the connection of a request; ``None``: nothing does."""
+    protocol = request.transport.get_protocol() if request.transport is not None else None
+    return protocol if isinstance(protocol, GuardedConnection) else None
