@@ -14,8 +14,8 @@ import msgspec
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.clients.connection import ClientStream
-from rmpa.web.clients.frame_writer import FairQueue, Opcode, OutFrame
+from rmpa.web.hub.connection import ClientStream
+from rmpa.web.hub.frame_writer import FairQueue, Opcode, OutFrame
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING

@@ -18,7 +18,7 @@ import msgspec
 from rmpa.config.values import did_you_mean
 from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
-from rmpa.web.clients.clients import CLIENT_REFUSALS, PROTOCOLS, ClientFigures
+from rmpa.web.clients import CLIENT_REFUSALS, PROTOCOLS, ClientFigures
 from rmpa.web.server.access import Problem
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import aiohttp
 from aiohttp import web
 
 from rmpa.ros.core.embedded import RosCore
-from rmpa.web.clients.clients import MONITOR_PATH, WebSocketClients
+from rmpa.web.clients import MONITOR_PATH, WebSocketClients
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.monitor.monitor import Monitor
 from rmpa.web.server.agent_watch import AgentWatch

@@ -6,9 +6,9 @@ from typing import Any
 
 import msgspec
 
-from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.session import FoxgloveSession
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.node_link import Rights
 from tests.web.recorder import Asked, FakeHub, Recorded, record

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.web.clients.frame_writer import Opcode, OutFrame
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
 from rmpa.web.foxglove.session import DECODER, OPS
+from rmpa.web.hub.frame_writer import Opcode, OutFrame
 from rmpa.web.hub.node_link import ParamValue
 from tests.web.foxglove.client import Client
 from tests.web.recorder import Asked

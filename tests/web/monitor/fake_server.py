@@ -37,7 +37,7 @@ from rmpa.observe.peers import judge_stranger
 from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import driving, limits

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import (
@@ -38,7 +38,7 @@ from rmpa.web.rosbridge.protocol import (
 if TYPE_CHECKING:
     import random
 
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
 
 pillow = pytest.importorskip("PIL.Image", reason="pillow, which checks pictures, comes with the extra lab")
 STRING = codec_for(MessageType("std_msgs/String"))

@@ -17,8 +17,8 @@ import pytest
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
-from rmpa.web.clients.clients import WebSocketClients
-from rmpa.web.clients.frame_writer import Opcode, frame_header
+from rmpa.web.clients import WebSocketClients
+from rmpa.web.hub.frame_writer import Opcode, frame_header
 from rmpa.web.hub.node_link import EVERYTHING, NodeRules
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch

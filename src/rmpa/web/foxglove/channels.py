@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from rmpa.core.errors import RmpaError
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.clients.connection import Session
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.connection import Session
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower
 

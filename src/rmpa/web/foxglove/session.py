@@ -14,16 +14,16 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import ClientStream, Session, decoder_of, ops_of
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
+from rmpa.web.hub.connection import ClientStream, Session, decoder_of, ops_of
 from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
-    from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.foxglove.channels import Channel, ChannelTable
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, ParamValue, Payload, Rights
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.clients.connection import Session
+    from rmpa.web.hub.connection import Session
     from rmpa.web.hub.topics import ClientPublication
 
 _WORDS: Final = ("nan", "inf", "+inf", "-inf")

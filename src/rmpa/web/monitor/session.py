@@ -16,8 +16,8 @@ from msgspec import Meta
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import Session, decoder_of, ops_of
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.connection import Session, decoder_of, ops_of
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.driving import TWIST, Command, Driver, Joystick, type_driven
 from rmpa.web.monitor.layers import watch_of

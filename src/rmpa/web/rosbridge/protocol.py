@@ -22,14 +22,14 @@ import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.ros.types.codec import MessageCodec
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
 
 
 Id: TypeAlias = str | int | None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
-from rmpa.web.clients.connection import ClientStream, Session, ops_of
+from rmpa.web.hub.connection import ClientStream, Session, ops_of
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import (
     Assembler,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Coroutine, Mapping
 
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, Payload, Rights
     from rmpa.web.hub.services import ServedService

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.core.errors import RmpaError
-    from rmpa.web.clients.connection import Session
+    from rmpa.web.hub.connection import Session
 
 ACTION: Final = "/tf2_web_republisher"
 SERVICE: Final = "/republish_tfs"

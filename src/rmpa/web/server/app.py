@@ -22,7 +22,7 @@ from rmpa.core.errors import StartError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.web import api, limits
-from rmpa.web.clients.clients import MONITOR_PATH, is_upgrade
+from rmpa.web.clients import MONITOR_PATH, is_upgrade
 from rmpa.web.server.access import (
     TOKEN_PARAMETER,
     AccessPolicy,
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler
 
-    from rmpa.web.clients.clients import WebSocketClients
+    from rmpa.web.clients import WebSocketClients
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.recordings import RecordingFiles
     from rmpa.web.server.video import VideoStreams

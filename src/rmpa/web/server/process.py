@@ -23,8 +23,8 @@ from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
-from rmpa.web.clients.clients import WebSocketClients
-from rmpa.web.clients.connection import Session
+from rmpa.web.clients import WebSocketClients
+from rmpa.web.hub.connection import Session
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.monitor import Monitor

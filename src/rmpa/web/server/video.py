@@ -22,7 +22,7 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
-from rmpa.web.clients.connection import tune
+from rmpa.web.hub.connection import tune
 from rmpa.web.monitor.messages import compressed_picture, raw_picture
 from rmpa.web.server.access import Problem, guard_of
 

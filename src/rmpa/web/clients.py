@@ -18,11 +18,11 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import FrameSocket
 from rmpa.web.foxglove import limits as foxglove_limits
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS
 from rmpa.web.foxglove.session import FoxgloveSession
+from rmpa.web.hub.frame_writer import FrameSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.rosbridge.protocol import PublishFrames
@@ -31,7 +31,7 @@ from rmpa.web.rosbridge.session import RosbridgeSession
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.web.clients.connection import ClientConnection, Session
+    from rmpa.web.hub.connection import ClientConnection, Session
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.monitor import Monitor

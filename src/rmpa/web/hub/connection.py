@@ -25,7 +25,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB, MIB
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
+from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.server.access import guard_of
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from rmpa.web.clients.frame_writer import FrameSocket
+    from rmpa.web.hub.frame_writer import FrameSocket
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.web import limits
-from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
-from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, frame_header
-from rmpa.web.server.access import MaskCheck
+from rmpa.web.hub.connection import CommandAge, MessageArrival, Session
+from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, frame_header
 from rmpa.web.hub.node_link import READ_ONLY
+from rmpa.web.server.access import MaskCheck
 from tests.waiting import DEADLINE, until
 
 # 4 MB, in which a part that is left out or twice would show.
