@@ -12,6 +12,7 @@ import cbor2
 import msgspec
 
 from rmpa.core.errors import RmpaError
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.connection import ClientStream
@@ -19,7 +20,7 @@ from rmpa.web.hub.frame_writer import FairQueue, Opcode, OutFrame
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
-from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.hub.topics import MadeOnce, ReceivedMessage
 from rmpa.web.hub.transforms import TransformTree
 
 NOW_NS = 1_700_000_000_000_000_123
@@ -111,6 +112,9 @@ class Types:
     def version(self, name: str, md5sum: str) -> MessageType:
         return self.versions.get(md5sum) or self.message(name)
 
+    def codec(self, message: ReceivedMessage) -> MessageCodec:
+        return codec_for(self.version(message.type, message.md5sum))
+
     def service(self, name: str) -> ServiceType:
         return ServiceType(name)
 
@@ -148,6 +152,7 @@ class FakeHub:
         self.types = Types()
         self.published: dict[str, str] = {}
         self.params = Params()
+        self.frames: MadeOnce[OutFrame] = MadeOnce(1 << 20)
         self.link = SimpleNamespace(rules=EVERYTHING)
         # Of parts that all clients share: what each topic's message is given to, while it is subscribed to.
         self.shared: dict[str, Callable[[ReceivedMessage], None]] = {}

@@ -25,7 +25,6 @@ from rmpa.web.foxglove.session import FoxgloveSession
 from rmpa.web.hub.frame_writer import FrameSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.session import MonitorSession
-from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
@@ -105,7 +104,7 @@ class WebSocketClients:
         self._protocols: dict[str, Callable[[Hub, Rights, Callable[[str], int], str], Session]] = {
             **{name: other for other in others for name in other.subprotocols},
             **dict.fromkeys(SUBPROTOCOLS, foxglove),
-            "": functools.partial(RosbridgeSession, encoder=PublishFrames()),
+            "": RosbridgeSession,
         }
         self._kinds = *PROTOCOLS, *(other.kind for other in others)
         self._open: dict[Session, FrameSocket] = {}
@@ -138,7 +137,7 @@ class WebSocketClients:
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
                 return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
-            await self._monitor.mesh.first()
+            await self._monitor.first()
             page = MonitorSession(self._hub, self._rights, self._priority, address, self._monitor)
             return await self._serve(request, page, page.frame_max)
         chosen = next((name for name in offered if name in self._protocols), None if offered else "")

@@ -116,7 +116,7 @@ class Reports:
         self.take = take
         return SimpleNamespace(close=lambda: None)
 
-    def of(self, message: Any) -> Any:
+    def values(self, message: Any) -> Any:
         return message.values
 
     def report(self) -> None:
@@ -282,7 +282,7 @@ class FakeServer:
         self._mute_since = 0.0
         self.reports_of_nodes = Reports()
         reports: Any = self.reports_of_nodes
-        self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
+        self._diagnostics = DiagnosticsFeed(reports, lambda: None)
         self._reported = 0.0
         self.recordings = Recordings()
         # Where the files of resources are, while it is served.
@@ -328,7 +328,7 @@ class FakeServer:
         if self.params != self._params_told:
             self._params_told = dict(self.params)
             self._param_changes += 1
-        self._diagnostics.follow(wanted=True)
+        self._diagnostics.follow()
         if self.agent.scene == "ill" and time.time() - self._reported > 0.5:
             self._reported = time.time()
             self.reports_of_nodes.report()
@@ -528,10 +528,16 @@ class _Client(Recorded):
     def __init__(self, server: FakeServer, socket: web.WebSocketResponse) -> None:
         self._server = server
         self._socket = socket
-        mesh = SimpleNamespace(agent="pc", details=server._details, follow=lambda *_: None, unfollow=lambda _: None)
-        answers, values = SimpleNamespace(answer=server.answer), SimpleNamespace(of=self._decode)
-        monitor: Any = SimpleNamespace(mesh=mesh, answers=answers, values=values, sticks=server.sticks)
+        monitor: Any = SimpleNamespace(
+            module="pc",
+            details=server._details,
+            follow=lambda *_: None,
+            unfollow=lambda _: None,
+            answers=server,
+            sticks=server.sticks,
+        )
         hub: Any = FakeHub()
+        hub.values = self._decode
         address = f"10.0.0.{next(server.pages)}"
         super().__init__(MonitorSession(hub, server.rights, lambda _: 0, address, monitor, time.monotonic))
         self.page = self.connection = self.session.connection = PageConnection(self)

@@ -40,13 +40,15 @@ class Page(Recorded):
         self.kept: list[Any] = []
         made: Any = Bus()
         monitor: Any = SimpleNamespace(
-            mesh=SimpleNamespace(agent="pc", details=self._details, follow=lambda *_: None, unfollow=lambda _: None),
-            values=SimpleNamespace(of=self._decode),
-            log=SimpleNamespace(follow=lambda *_: self.kept, unfollow=lambda _: None, refused=None),
+            module="pc",
+            details=self._details,
+            follow=lambda *_: None,
+            unfollow=lambda _: None,
             answers=SimpleNamespace(answer=self._asked),
             sticks=sticks or Sticks(made, lambda: "pc", lambda: self.now),
         )
         hub: Any = FakeHub()
+        hub.values = self._decode
         super().__init__(MonitorSession(hub, rights, lambda _: 0, "page", monitor, lambda: self.now))
         self.now = 100.0
         self.page = self.connection = self.session.connection = PageConnection(self)

@@ -19,19 +19,20 @@ from hypothesis import strategies as st
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
+from rmpa.web import limits as web_limits
 from rmpa.web.hub.frame_writer import Opcode
+from rmpa.web.hub.topics import MadeOnce
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge import protocol as encodings
 from rmpa.web.rosbridge.protocol import (
     Assembler,
     Compression,
     OpError,
-    PublishFrames,
     data_of,
     decode_png,
     encode_cbor_raw,
+    encode_message,
     encode_png,
-    size_of,
     split,
 )
 
@@ -68,7 +69,7 @@ def _pixels(text: str) -> bytes:
     ],
 )
 def test_golden_bytes(compression: Compression, data: bytes) -> None:
-    frame = PublishFrames().encode("/c", HELLO, compression, STRING)
+    frame = encode_message("/c", HELLO, compression, STRING)
     assert (frame[0] is Opcode.BINARY, data_of(frame)) == (compression is Compression.CBOR, data)
 
 
@@ -91,25 +92,22 @@ def test_cbor_raw_of_any_size_is_read_by_another_decoder_and_is_not_copied(size:
 
 
 def test_each_message_is_encoded_once_for_all_clients(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = PublishFrames()
-    first = frames.encode("/a", HELLO, Compression.CBOR, STRING)
-    assert frames.encode("/a", HELLO, Compression.CBOR, STRING) is first
-    assert frames.encode("/a", HELLO, Compression.NONE, STRING) is not first
-    assert frames.encode("/b", HELLO, Compression.CBOR, STRING) is not first
-    assert frames.encode("/a", memoryview(bytes(HELLO)), Compression.CBOR, STRING) is not first
+    frames: MadeOnce[list[str]] = MadeOnce(1000, lambda _: 100)
+    first = frames.get(HELLO, lambda: ["made"], "/a", Compression.CBOR)
+    assert frames.get(HELLO, lambda: ["made"], "/a", Compression.CBOR) is first
+    assert frames.get(HELLO, lambda: ["made"], "/a", Compression.NONE) is not first
+    assert frames.get(HELLO, lambda: ["made"], "/b", Compression.CBOR) is not first
+    assert frames.get(memoryview(bytes(HELLO)), lambda: ["made"], "/a", Compression.CBOR) is not first
 
 
-def test_shared_messages_are_bounded() -> None:
-    frames = PublishFrames()
-    big = codec_for(MessageType("std_msgs/UInt8MultiArray"))
-    size = limits.SHARED_BYTES // 5
-    for _ in range(6):
-        payload = memoryview(big.write({"data": bytes(size)}, 0).payload)
-        frames.encode("/a", payload, Compression.CBOR, big)
-    assert sum(size_of(frame) + len(payload) for payload, frame in frames._kept.values()) <= limits.SHARED_BYTES
-    for number in range(limits.SHARED_FRAMES * 2):
-        frames.encode(f"/{number}", HELLO, Compression.NONE, STRING)
-    assert len(frames._kept) <= limits.SHARED_FRAMES
+def test_what_is_kept_of_messages_is_bounded() -> None:
+    frames: MadeOnce[int] = MadeOnce(1000, lambda made: made)
+    for size in (2000, *[100] * 6):
+        frames.get(memoryview(bytes(100)), lambda made=size: made)  # type: ignore[misc]
+    assert 0 < frames.bytes <= 1000
+    for number in range(web_limits.MADE_KEPT * 2):
+        frames.get(HELLO, lambda: 0, number)
+    assert len(frames._kept) <= web_limits.MADE_KEPT
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 4, 11, 12, 13, 100, 4099])

@@ -25,7 +25,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB, MIB
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
-from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
+from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame, size_of
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.server.access import guard_of
 
@@ -269,7 +269,7 @@ class ClientConnection:
     def push(self, *frames: OutFrame) -> None:
         """Queue frames that are not dropped."""
         for frame in frames:
-            self._queue(None, partial(_as_it_is, frame), sum(map(len, frame[1])))
+            self._queue(None, partial(_as_it_is, frame), size_of(frame))
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
         """Queue a message of a subscription."""

@@ -50,6 +50,11 @@ class Opcode(IntEnum):
 OutFrame: TypeAlias = tuple[Opcode, Sequence["Payload"]]
 
 
+def size_of(frame: OutFrame) -> int:
+    """Bytes of a frame's payload."""
+    return sum(map(len, frame[1]))
+
+
 def frame_header(opcode: Opcode, size: int) -> bytes:
     """The header of one unmasked, unfragmented frame with ``size`` bytes of payload."""
     if size < 126:

@@ -17,6 +17,7 @@ from rmpa.observe.graph import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response
 from rmpa.ros.node.fetch_type import fetch_type
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import UnknownTypeError, known_text
 from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, known_services
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.ros.node.node import Node
+    from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.node_link import NodeLink
     from rmpa.web.hub.services import ServiceCalls
+    from rmpa.web.hub.topics import ReceivedMessage
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -246,6 +249,10 @@ class TypeLibrary:
             DefinitionError: As for ``message``.
         """
         return self._versions.get((name, md5sum)) or self.message(name)
+
+    def codec(self, message: ReceivedMessage) -> MessageCodec:
+        """Converts a message that was received; raises as ``version``."""
+        return codec_for(self.version(message.type, message.md5sum))
 
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""

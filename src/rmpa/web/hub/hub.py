@@ -15,17 +15,19 @@ from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
+from rmpa.web.hub.frame_writer import size_of
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
 from rmpa.web.hub.params import ParamMirror, RosTime, value_at
 from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
-from rmpa.web.hub.topics import HubTopics
+from rmpa.web.hub.topics import HubTopics, MadeOnce
 from rmpa.web.hub.transforms import TransformTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
     from rmpa.web.hub.services import ServedService
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
@@ -62,6 +64,9 @@ class Hub:
         self.topics = HubTopics(self.link, self.types, self.graph, time.time_ns)
         self.time = RosTime(self.topics, self.params, time.time_ns)
         self.counts = ClientCounts(self, time.time_ns)
+        # What rosbridge's clients are sent.
+        self.frames: MadeOnce[OutFrame] = MadeOnce(limits.FRAMES_KEPT_BYTES, size_of)
+        self._values: MadeOnce[Any] = MadeOnce(limits.VALUES_KEPT_BYTES)
         self.transforms = TransformTree(self.topics, self.types)
 
     async def __aenter__(self) -> Self:
@@ -95,6 +100,14 @@ class Hub:
         self.topics.close()
         self.served.close()
         await self.link.withdrawn()
+
+    def values(self, message: ReceivedMessage) -> Any:
+        """The values of a message, which all share: a map of 16 million cells is no list, but a view.
+
+        Raises:
+            RmpaError: Its type is not known, or its bytes are not a message of that type.
+        """
+        return self._values.get(message.payload, lambda: self.types.codec(message).views(message.payload))
 
     @property
     def clients(self) -> tuple[HubClient, ...]:

@@ -9,7 +9,7 @@ import logging
 import weakref
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import msgspec
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import NodeLink, Payload
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 
 class PayloadBuffers:
@@ -92,6 +93,41 @@ def _has_views(buffer: bytearray) -> bool:
         return True
     buffer.append(0)  # moves nothing: its memory has not become smaller
     return False
+
+
+class MadeOnce(Generic[_T]):
+    """What is made of messages, once for all clients: these get a topic's message at nearly the same time.
+
+    A message is recognised by its payload, which is the same memoryview for all.
+
+    Args:
+        most_bytes: Of the messages that are kept, and of what was made of them.
+        size: Bytes of what was made of one.
+    """
+
+    def __init__(self, most_bytes: int, size: Callable[[_T], int] = lambda _: 0) -> None:
+        self._most = most_bytes
+        self._size = size
+        self._kept: OrderedDict[tuple[object, ...], tuple[Payload, int, _T]] = OrderedDict()
+        # Bytes of all that is kept.
+        self.bytes = 0
+
+    def get(self, payload: memoryview, make: Callable[[], _T], *how: object) -> _T:
+        """What was made of a message in one way; it is shared, and must not be changed. Raises as ``make``."""
+        key = (id(payload), *how)
+        kept = self._kept.get(key)
+        if kept is not None:
+            # The payload is kept too, so its id cannot have been given to another.
+            self._kept.move_to_end(key)
+            return kept[2]
+        made = make()
+        size = self._size(made) + len(payload)
+        if size <= self._most:
+            self._kept[key] = payload, size, made
+            self.bytes += size
+            while self.bytes > self._most or len(self._kept) > limits.MADE_KEPT:
+                self.bytes -= self._kept.popitem(last=False)[1][1]
+        return made
 
 
 # The source of what clients of this hub publish: the node has no connection to itself.

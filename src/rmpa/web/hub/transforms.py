@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Follower
 
@@ -115,8 +114,7 @@ class TransformTree:
     def take(self, message: ReceivedMessage) -> None:
         """A tf2_msgs/TFMessage, or what has the same bytes; what is broken in it is left out, as tf2 does."""
         try:
-            codec = codec_for(self._types.version(message.type, message.md5sum))
-            rows = codec.json_values(message.payload)["transforms"]
+            rows = self._types.codec(message).json_values(message.payload)["transforms"]
         except (RmpaError, KeyError):
             return  # a message of another type
         for row in rows:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import ParamValue
-    from rmpa.web.monitor.resources import ResourceWatch
+    from rmpa.web.monitor.monitor import Monitor
 
 _log = logging.getLogger(__name__)
 
@@ -79,28 +79,16 @@ class Answers:
 
     Args:
         hub: Calls services, and has this module's parameters.
-        resources: Knows the Smart Resources.
+        monitor: Knows the agent, the Smart Resources and the diagnostics.
         environ: Says where the agents' sockets are.
-        agent: Returns the agent's name; empty for the only one.
-        past: The past of the values of a status of ``/diagnostics``, by its key.
-        descriptions: The files that describe this module's resources.
+        folder: Where the files that describe this module's resources are; empty for none.
     """
 
-    def __init__(
-        self,
-        hub: Hub,
-        resources: ResourceWatch,
-        environ: Mapping[str, str],
-        agent: Callable[[], str],
-        past: Callable[[str], Any] = lambda _: {},
-        descriptions: Descriptions | None = None,
-    ) -> None:
+    def __init__(self, hub: Hub, monitor: Monitor, environ: Mapping[str, str], folder: str = "") -> None:
         self._hub = hub
-        self._past_of = past
-        self._resources = resources
+        self._monitor = monitor
         self._environ = environ
-        self._agent_name = agent
-        self._descriptions = descriptions or Descriptions()
+        self.descriptions = Descriptions(folder)
         # Each check starts a program: one at a time, and no save between the check and the end of another.
         self._checks = asyncio.Lock()
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
@@ -134,7 +122,7 @@ class Answers:
         return await self.ask_agent("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
     async def _past(self, args: Args) -> Any:
-        return self._past_of(_text(args, "status"))
+        return self._monitor.diagnostics.past(_text(args, "status"))
 
     async def _graph(self, args: Args) -> Any:
         """The graph of this module's core: each topic with its type and its nodes, proxies included, and services.
@@ -238,7 +226,7 @@ class Answers:
     async def _keep_recording(self, args: Args) -> Any:
         """Keep what the rings of all modules have; why each that cannot does not."""
         why = _text(args, "why")[: limits.LOG_CHARACTERS]
-        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._agent_name(), time.time_ns())}")
+        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._monitor.agent, time.time_ns())}")
         return await self.ask_agent("record", what="keep", why=why)
 
     async def _remove_recording(self, args: Args) -> Any:
@@ -255,13 +243,13 @@ class Answers:
             return await asyncio.get_running_loop().run_in_executor(self._threads, call)
 
     async def _description(self, args: Args) -> Any:
-        return await self._of_file(args, self._descriptions.read)
+        return await self._of_file(args, self.descriptions.read)
 
     async def _check_description(self, args: Args) -> Any:
-        return {"problems": await self._of_file(args, self._descriptions.check, "text")}
+        return {"problems": await self._of_file(args, self.descriptions.check, "text")}
 
     async def _save_description(self, args: Args) -> Any:
-        return await self._of_file(args, self._descriptions.save, "text", "digest")
+        return await self._of_file(args, self.descriptions.save, "text", "digest")
 
     async def ask_agent(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""
@@ -272,7 +260,7 @@ class Answers:
 
     async def _in_thread(self, do: Callable[[ControlClient], Any]) -> Any:
         def ask() -> Any:
-            agent = choose_agent(self._environ, self._agent_name() or None)
+            agent = choose_agent(self._environ, self._monitor.agent or None)
             with ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
                 return do(client)
 
@@ -393,7 +381,7 @@ class Answers:
 
     async def _configure(self, args: Args) -> Any:
         resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
-        facts = self._resources.facts.get(node_key(_text(args, "peer"), resource))
+        facts = self._monitor.resources.facts.get(node_key(_text(args, "peer"), resource))
         known = facts.descriptor.get("parameters", ()) if facts is not None else ()
         kind = next((each["type"] for each in known if each.get("name") == name), None)
         if kind not in _LISTS:

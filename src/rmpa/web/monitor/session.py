@@ -152,13 +152,13 @@ class MonitorSession(Session):
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN, "steer": limits.DRIVE_STEER}
         fastest["acceleration"] = limits.DRIVE_ACCELERATION
         may = [right for right in RIGHTS if getattr(self._may, right)]
-        about = {"agent": self._monitor.mesh.agent, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
+        about = {"agent": self._monitor.module, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
         self._send({"op": "hello", "version": VERSION, "at": self._opened, **about})
-        self._monitor.mesh.follow(self, self._update)
+        self._monitor.follow(self, self._update)
 
     def closing(self) -> None:
         """Stop the robot, and all that the page had open."""
-        self._monitor.mesh.unfollow(self)
+        self._monitor.unfollow(self)
         self._stop()
         self._show_stick("")
         self._publications.close()
@@ -210,7 +210,7 @@ class MonitorSession(Session):
             if self._stick is not None:
                 self._stick.handle_timer(self)
             self._publications.handle_timer(now)
-            if (news := self._patches.take(now, self._monitor.mesh.details)) is not None:
+            if (news := self._patches.take(now, self._monitor.details)) is not None:
                 self._send(news)
             self._flush(now)
             if now >= self._tick:
@@ -276,7 +276,7 @@ class MonitorSession(Session):
             raise RemoteProtocolError(f"watch {id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        watch = watch_of(id, how, fields, rate, self._monitor.values.of, width)
+        watch = watch_of(id, how, fields, rate, self.hub.values, width)
         self._watches[id] = watch, None
 
         def receive(message: ReceivedMessage) -> None:

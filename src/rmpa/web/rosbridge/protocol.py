@@ -22,7 +22,7 @@ import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
-from rmpa.web.hub.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode, size_of
 from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:
@@ -220,41 +220,12 @@ class Compression(enum.IntEnum):
         raise OpError(f"unknown compression {str(name)[:40]!r}", "it is none, png, cbor or cbor-raw")
 
 
-class PublishFrames:
-    """Encodes messages for subscribers, each once for all clients of a topic that want it alike.
+def encode_message(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
+    """A ``publish`` in JSON, PNG or CBOR.
 
-    A message is recognised by its payload, which must be the same memoryview for all. The last
-    `limits.SHARED_FRAMES` are kept.
+    Raises:
+        MessageError: The payload is not a message of the codec's type.
     """
-
-    def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, OutFrame]] = OrderedDict()
-        self._bytes = 0
-
-    def encode(self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
-        """A ``publish`` in JSON, PNG or CBOR.
-
-        Raises:
-            MessageError: The payload is not a message of the codec's type.
-        """
-        key = (id(payload), topic, compression)
-        kept = self._kept.get(key)
-        if kept is not None:
-            # The payload is kept too, so its id cannot have been given to another.
-            self._kept.move_to_end(key)
-            return kept[1]
-        frame = _encode(topic, payload, compression, codec)
-        size = size_of(frame) + len(payload)
-        if size <= limits.SHARED_BYTES:
-            self._kept[key] = (payload, frame)
-            self._bytes += size
-            while self._bytes > limits.SHARED_BYTES or len(self._kept) > limits.SHARED_FRAMES:
-                _, (old, gone) = self._kept.popitem(last=False)
-                self._bytes -= size_of(gone) + len(old)
-        return frame
-
-
-def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
     if compression is Compression.CBOR:
         return encode({"op": "publish", "topic": topic, "msg": codec.cbor_values(payload)}, compression)
     head = b'{"op":"publish","topic":' + msgspec.json.encode(topic) + b',"msg":'
@@ -268,11 +239,6 @@ def encode(values: Mapping[str, Any], compression: Compression = Compression.NON
         return Opcode.BINARY, (cbor2.dumps(values),)
     text = msgspec.json.encode(values)
     return encode_png(text) if compression is Compression.PNG else (Opcode.TEXT, (text,))
-
-
-def size_of(frame: OutFrame) -> int:
-    """Bytes of a frame."""
-    return sum(map(len, frame[1]))
 
 
 def data_of(frame: OutFrame) -> Part:

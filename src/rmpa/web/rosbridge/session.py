@@ -17,11 +17,11 @@ from rmpa.web.rosbridge.protocol import (
     Id,
     OpError,
     Part,
-    PublishFrames,
     check_count,
     decode_png,
     encode,
     encode_cbor_raw,
+    encode_message,
     graph_name,
     id_of,
     parse_frame,
@@ -73,7 +73,6 @@ class _Topic(ClientStream):
         self.judged_at: float | None = None
         self._compression = Compression.NONE
         self._fragment_size: int | None = None
-        self._codecs: dict[tuple[str, str], MessageCodec] = {}
         self._problem = ""
 
     def choose(self) -> None:
@@ -98,11 +97,12 @@ class _Topic(ClientStream):
     def _encode(self, message: ReceivedMessage) -> OutFrame:
         if self._compression is Compression.CBOR_RAW:
             return encode_cbor_raw(self.name, message.payload, message.stamp_ns)
-        version = message.type, message.md5sum
-        codec = self._codecs.get(version)
-        if codec is None:
-            codec = self._codecs[version] = codec_for(self._session.hub.types.version(*version))
-        return self._session.encoder.encode(self.name, message.payload, self._compression, codec)
+        hub = self._session.hub
+
+        def make() -> OutFrame:
+            return encode_message(self.name, message.payload, self._compression, hub.types.codec(message))
+
+        return hub.frames.get(message.payload, make, self.name, self._compression)
 
 
 @dataclass(slots=True)
@@ -146,18 +146,14 @@ class RosbridgeSession(Session):
         rights: What the client may do.
         priority: The priority of a topic's messages.
         address: The client's, for logs.
-        encoder: Encodes messages; one for all sessions of a process.
     """
 
     kind = "rosbridge"
     frame_max = limits.FRAME_MAX
 
     # More than 12 fields: what the client has of each kind, and what it has in fragments.
-    def __init__(
-        self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str, encoder: PublishFrames
-    ) -> None:
+    def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
         super().__init__(hub, rights, priority, address)
-        self.encoder = encoder
         self._rosapi = Rosapi(self)
         self._tf = TfRepublisher(self)
         self._level = "error"

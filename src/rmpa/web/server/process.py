@@ -356,8 +356,7 @@ async def serve(
     video = VideoStreams(hub)
     place = state_dir(os.environ, setup.settings.state_dir or None)
     files = module_dir(place, setup.module) / f"web-{web.port}" if place is not None else None
-    view, name_of = setup.rights.view, lambda: agent or monitor.mesh.agent
-    recordings = RecordingFiles(setup.rules, files, name_of, view=view)
+    recordings = RecordingFiles(setup.rules, files, lambda: monitor.agent, view=setup.rights.view)
     server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context, video, recordings)
     try:
         async with hub:
