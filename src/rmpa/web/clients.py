@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-import secrets
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -77,7 +76,6 @@ class WebSocketClients:
         hub: The hub.
         name: The server's name, for users.
         rights: What clients may do.
-        priority: The priority of a topic's messages: higher ones go first.
         monitor: Serves the pages at ``MONITOR_PATH``; without it there are none.
         others: Further protocols.
     """
@@ -87,7 +85,6 @@ class WebSocketClients:
         hub: Hub,
         name: str,
         rights: Rights,
-        priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
         others: Sequence[type[Session]] = (),
     ) -> None:
@@ -97,11 +94,10 @@ class WebSocketClients:
         self._monitor = monitor
         self._hub = hub
         self._rights = rights
-        self._priority = priority
-        self._channels = ChannelTable(hub, services=rights.control)
-        foxglove = functools.partial(FoxgloveSession, table=self._channels, server=(name, secrets.token_hex(8)))
+        self._channels = ChannelTable(hub, name, services=rights.control)
+        foxglove = functools.partial(FoxgloveSession, table=self._channels)
         # By the subprotocol that a client offers; empty for none.
-        self._protocols: dict[str, Callable[[Hub, Rights, Callable[[str], int], str], Session]] = {
+        self._protocols: dict[str, Callable[[Hub, Rights, str], Session]] = {
             **{name: other for other in others for name in other.subprotocols},
             **dict.fromkeys(SUBPROTOCOLS, foxglove),
             "": RosbridgeSession,
@@ -138,14 +134,14 @@ class WebSocketClients:
             if self._monitor is None or SUBPROTOCOL not in offered:
                 return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
             await self._monitor.first()
-            page = MonitorSession(self._hub, self._rights, self._priority, address, self._monitor)
+            page = MonitorSession(self._hub, self._rights, address, self._monitor)
             return await self._serve(request, page, page.frame_max)
         chosen = next((name for name in offered if name in self._protocols), None if offered else "")
         if chosen is None:
             spoken = f"{', '.join(filter(None, self._protocols))}, and rosbridge without a subprotocol"
             return self._refuse_protocol(address, f"{', '.join(offered)[:80]!a} is not spoken here: {spoken} are")
         await self._hub.settled(limits.SETTLE)
-        session = self._protocols[chosen](self._hub, self._rights, self._priority, address)
+        session = self._protocols[chosen](self._hub, self._rights, address)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         most = session.frame_max if self._rights.control else foxglove_limits.TEXT_MAX
         return await self._serve(request, session, most)

@@ -52,7 +52,7 @@ _TURN: Final = 16
 # Looks without a sign of life, each after half of ``limits.PING_INTERVAL``.
 _SILENT_LOOKS: Final = 3
 # Makes the frames of an entry of the queue, when they can be written.
-_Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
+_Entry: TypeAlias = "Callable[[], Iterable[OutFrame]]"
 # Pings within the age that a client's commands may have.
 _AGE_PINGS: Final = 4
 
@@ -93,7 +93,6 @@ class Session(HubClient):
     Args:
         hub: The hub.
         rights: What the client may do.
-        priority: The priority of a topic's messages: higher ones go first.
         address: The client's, for logs.
     """
 
@@ -106,11 +105,11 @@ class Session(HubClient):
     # Whether the protocol itself says how old a command is.
     dates_commands = False
 
-    def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
+    def __init__(self, hub: Hub, rights: Rights, address: str) -> None:
         super().__init__(hub, f"{self.kind} {address}", rights)
         self.address = address
         self._late_told = -limits.DROPS_SHOWN
-        self.connection = ClientConnection(self, priority)
+        self.connection = ClientConnection(self)
 
     def late(self) -> str:
         """Why a command that comes now may be too old, by the pings that the client has answered."""
@@ -153,7 +152,7 @@ class ClientStream:
     topic: str
 
     @abstractmethod
-    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:
+    def frames(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frames of a message; called when the connection can take them."""
 
 
@@ -242,13 +241,11 @@ class ClientConnection:
 
     Args:
         session: Its protocol.
-        priority: The priority of a topic's messages: higher ones go first.
     """
 
     # More than 12 fields: the socket, the two timers, and what is known of both directions.
-    def __init__(self, session: Session, priority: Callable[[str], int]) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._priority = priority
         self.queue: FairQueue[_Entry] = FairQueue()
         # Messages and answers that were written.
         self.sent = 0
@@ -269,7 +266,7 @@ class ClientConnection:
     def push(self, *frames: OutFrame) -> None:
         """Queue frames that are not dropped."""
         for frame in frames:
-            self._queue(None, partial(_as_it_is, frame), size_of(frame))
+            self._queue(None, partial(tuple, (frame,)), size_of(frame))
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
         """Queue a message of a subscription."""
@@ -449,15 +446,14 @@ class ClientConnection:
                 if self._close is not None:
                     await socket_.close(code=self._close[0], message=self._close[1].encode()[:120])
                     return
-                now = self.now()
-                entry = self.queue.pop(now)
+                entry = self.queue.pop(self.now())
                 if entry is None:
                     self._wake.clear()
                     with contextlib.suppress(TimeoutError):
                         async with asyncio.timeout_at(self.queue.due):
                             await self._wake.wait()
                     continue
-                for opcode, parts in entry(now):
+                for opcode, parts in entry():
                     self._send(opcode, parts)
                 self._tell_drops()
                 await out.drain()
@@ -492,7 +488,7 @@ class ClientConnection:
     def _queue(self, stream: ClientStream | None, entry: _Entry, size: int) -> None:
         if self._gone:
             return
-        priority = self._priority(stream.topic) if stream else 0
+        priority = self._session.hub.priority(stream.topic) if stream else 0
         self.queue.push(stream, entry, size + _OVERHEAD, priority, self.now())
         if self.queue.overflow:
             _log.warning("! %s does not read its answers, and is disconnected [reader-slow]", self._session.name)
@@ -519,10 +515,6 @@ class ClientConnection:
     def _abort(self) -> None:
         if self._transport is not None:
             self._transport.abort()
-
-
-def _as_it_is(frame: OutFrame, _: float) -> tuple[OutFrame]:
-    return (frame,)
 
 
 def tune(transport: asyncio.Transport, unsent: int = 512 * KIB) -> None:

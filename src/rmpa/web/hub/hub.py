@@ -11,6 +11,7 @@ import weakref
 from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 
 from rmpa.config.peer_rules import Access
+from rmpa.core.contract import Priority
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.runtime.tasks import OwnedTasks
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
+    from rmpa.core.contract import Contracts
     from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
     from rmpa.web.hub.services import ServedService
@@ -40,6 +42,7 @@ _COUNT: Final = "/client_count"
 _CLIENTS: Final = "/connected_clients"
 _TYPES: Final = {_COUNT: "std_msgs/Int32", _CLIENTS: "rosbridge_msgs/ConnectedClients"}
 _NANO: Final = 1_000_000_000
+_PRIORITIES: Final = {Priority.HIGH: 1, Priority.NORMAL: 0, Priority.LOW: -1}
 
 
 class Hub:
@@ -49,10 +52,19 @@ class Hub:
         where: Finds the master.
         make_node: Makes the node; it is made anew when the master was away or has shut it down.
         rules: What the node may do.
+        contracts: Of topics.
     """
 
     # More than 12 fields: the parts, each once.
-    def __init__(self, where: Where, make_node: MakeNode, *, rules: NodeRules = EVERYTHING) -> None:
+    def __init__(
+        self,
+        where: Where,
+        make_node: MakeNode,
+        *,
+        rules: NodeRules = EVERYTHING,
+        contracts: Contracts | None = None,
+    ) -> None:
+        self._contracts = contracts
         self._started = False
         self._clients: dict[HubClient, None] = {}
         self.link = NodeLink(where, make_node, rules)
@@ -108,6 +120,14 @@ class Hub:
             RmpaError: Its type is not known, or its bytes are not a message of that type.
         """
         return self._values.get(message.payload, lambda: self.types.codec(message).views(message.payload))
+
+    def priority(self, topic: str) -> int:
+        """The priority of a topic's messages, by its contract: higher ones go first."""
+        if self._contracts is None:
+            return 0
+        known = self.graph.topics.get(topic)
+        type_ = known.types[0] if known is not None and known.types else ""
+        return _PRIORITIES[self._contracts.of(topic, type_).priority]
 
     @property
     def clients(self) -> tuple[HubClient, ...]:

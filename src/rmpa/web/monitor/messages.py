@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.web.hub.node_link import Payload
-    from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
 
     Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
@@ -387,6 +387,8 @@ class WatchState:
         self.beat = Beat()
         # Whether a frame is being made in a thread.
         self.busy = False
+        # ``None`` while there is none yet, or it was refused.
+        self.subscription: ClientSubscription | None = None
 
     def receive(self, message: ReceivedMessage) -> None:
         """Keep a message; a plot takes its numbers at once, all others decode only what is sent.
@@ -404,10 +406,14 @@ class WatchState:
         """The page has drawn an image."""
         self._unseen = max(0, self._unseen - 1)
 
+    def waits(self) -> bool:
+        """Whether there is something to send, and the page is not behind."""
+        waiting = len(self._samples) > 0 if self._paths else self._newest is not None
+        return waiting and self._unseen < limits.UNSEEN_MAX
+
     def due(self, now: float) -> float | None:
         """When the next frame may be sent; ``None`` while there is nothing to send, or the page is behind."""
-        waiting = len(self._samples) > 0 if self._paths else self._newest is not None
-        return max(now, self._next) if waiting and self._unseen < limits.UNSEEN_MAX else None
+        return max(now, self._next) if self.waits() else None
 
     def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The picture or message that is due.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
+    from rmpa.web.hub.topics import ReceivedMessage
     from rmpa.web.monitor.monitor import Monitor
     from rmpa.web.monitor.sticks import Stick
 
@@ -111,7 +111,6 @@ class MonitorSession(Session):
     Args:
         hub: The hub.
         rights: What the page may do.
-        priority: The priority of a topic's messages.
         address: The page's, for logs.
         monitor: What all pages share.
         clock: Monotonic seconds; the event loop's unless it is given.
@@ -125,13 +124,12 @@ class MonitorSession(Session):
         self,
         hub: Hub,
         rights: Rights,
-        priority: Callable[[str], int],
         address: str,
         monitor: Monitor,
         clock: Callable[[], float] | None = None,
     ) -> None:
         # The joystick publishes by the hub; each op checks the page's own right.
-        super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), priority, address)
+        super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), address)
         self._may = rights
         self._monitor = monitor
         self._clock = clock or asyncio.get_running_loop().time
@@ -139,7 +137,7 @@ class MonitorSession(Session):
         self._tick = self._opened + limits.TICK_PERIOD
         self._bucket = TokenBucket(limits.REQUEST_RATE, limits.REQUEST_BURST)
         self._patches = StatePatches(self._opened)
-        self._watches: dict[int, tuple[WatchState, ClientSubscription | None]] = {}
+        self._watches: dict[int, WatchState] = {}
         self._questions: set[int] = set()
         self._joystick = Joystick()
         self._driver: Driver | None = None
@@ -196,7 +194,7 @@ class MonitorSession(Session):
         if self._stick is not None and (wait := self._stick.due(self)) is not None:
             dues.append(self._clock() + wait)
         if self.connection.unsent == 0:
-            dues += [watch.due(0.0) for watch, _ in self._watches.values()]
+            dues += [watch.due(0.0) for watch in self._watches.values()]
         elif self._watches:
             dues.append(self._looked + limits.UNSENT_RETRY)
         return min(due for due in dues if due is not None)
@@ -277,7 +275,7 @@ class MonitorSession(Session):
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
         watch = watch_of(id, how, fields, rate, self.hub.values, width)
-        self._watches[id] = watch, None
+        self._watches[id] = watch
 
         def receive(message: ReceivedMessage) -> None:
             with self._turn():
@@ -292,31 +290,29 @@ class MonitorSession(Session):
                 self._end_watch(id, error)
 
         try:
-            subscription = self.subscribe(topic, None, receive, failed)
+            watch.subscription = self.subscribe(topic, None, receive, failed)
         except RmpaError as error:
             self._end_watch(id, error)
-        else:
-            self._watches[id] = watch, subscription
 
     def op_seen(self, _: float, *, ids: Annotated[tuple[Id, ...], Meta(max_length=limits.WATCHES_MAX)]) -> None:
         """An image of each of these watches is drawn."""
         for id_ in ids:
             if (known := self._watches.get(id_)) is not None:
-                known[0].seen()
+                known.seen()
 
     def op_unwatch(self, _: float, *, id: Id) -> None:  # noqa: A002
         """No more messages of that watch."""
         self._end_watch(id)
 
     def _end_watch(self, id_: int, error: RmpaError | None = None) -> None:
-        _, subscription = self._watches.pop(id_, (None, None))
-        if subscription is not None:
-            subscription.close()
+        watch = self._watches.pop(id_, None)
+        if watch is not None and watch.subscription is not None:
+            watch.subscription.close()
         if error is not None:
             self._failed(id_, error)
 
     def _flush(self, now: float) -> None:
-        for id_, (watch, _) in [*self._watches.items()] if self.connection.unsent == 0 else ():
+        for id_, watch in [*self._watches.items()] if self.connection.unsent == 0 else ():
             due = watch.due(now)
             if due is None or due > now:
                 continue
@@ -340,7 +336,7 @@ class MonitorSession(Session):
 
         def done(frame: bytes) -> None:
             watch.busy = False
-            if self._watches.get(id_, (None,))[0] is watch:
+            if self._watches.get(id_) is watch:
                 with self._turn():
                     self.connection.push((Opcode.BINARY, (frame,)))
 

@@ -83,7 +83,7 @@ class _Topic(ClientStream):
         self._compression = max(compressions)
         self._fragment_size = min(filter(None, sizes), default=None)
 
-    def frames(self, message: ReceivedMessage, now: float) -> list[OutFrame]:  # noqa: ARG002
+    def frames(self, message: ReceivedMessage) -> list[OutFrame]:
         """The frames of a message; none of one that is broken."""
         try:
             return self._session.split(self._encode(message), self._fragment_size)
@@ -144,7 +144,6 @@ class RosbridgeSession(Session):
     Args:
         hub: The hub.
         rights: What the client may do.
-        priority: The priority of a topic's messages.
         address: The client's, for logs.
     """
 
@@ -152,8 +151,8 @@ class RosbridgeSession(Session):
     frame_max = limits.FRAME_MAX
 
     # More than 12 fields: what the client has of each kind, and what it has in fragments.
-    def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
-        super().__init__(hub, rights, priority, address)
+    def __init__(self, hub: Hub, rights: Rights, address: str) -> None:
+        super().__init__(hub, rights, address)
         self._rosapi = Rosapi(self)
         self._tf = TfRepublisher(self)
         self._level = "error"
