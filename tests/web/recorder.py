@@ -156,7 +156,7 @@ class FakeHub:
         self.link = SimpleNamespace(rules=EVERYTHING)
         # Of parts that all clients share: what each topic's message is given to, while it is subscribed to.
         self.shared: dict[str, Callable[[ReceivedMessage], None]] = {}
-        self.topics = SimpleNamespace(publishers=SimpleNamespace(names=self.published), subscribe=self._subscribe)
+        self.topics = SimpleNamespace(published=self.published, subscribe=self._subscribe)
         topics: Any = self.topics
         types: Any = self.types
         self.transforms = TransformTree(topics, types)

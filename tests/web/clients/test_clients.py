@@ -154,7 +154,7 @@ async def test_the_hub_has_nothing_left_of_a_client_that_went(
                 await until(lambda: not server.hub.clients)
             await until(lambda: publisher.subscribers == 0 and not core.publishers("/u"))
         assert not server.sockets.connections
-        assert not server.hub.topics.names
+        assert not server.hub.topics.subscribed
 
 
 @contextlib.asynccontextmanager

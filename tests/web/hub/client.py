@@ -63,7 +63,7 @@ async def running_hub(
 
 async def subscribed(hub: Hub, count: int) -> None:
     """Wait until the hub's clients have so many subscriptions."""
-    await until(lambda: sum(len(each.subscriptions) for each in hub.topics._topics.values()) >= count)
+    await until(lambda: sum(len(each.users) for each in hub.topics.subscribed.values()) >= count)
 
 
 class Heard:

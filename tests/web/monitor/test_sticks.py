@@ -26,7 +26,6 @@ class Bus:
         self.held: list[Callable[[], None]] | None = None
         self.refuses: RmpaError | None = None
         self.topics: Any = self
-        self.publishers: Any = self
 
     def subscribe(self, topic: str, _type: str, receive: Callable[[ReceivedMessage], None], _failed: Any) -> Any:
         entry = topic, receive

@@ -20,7 +20,7 @@ from rmpa.web.hub.frame_writer import size_of
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
 from rmpa.web.hub.params import ParamMirror, RosTime, value_at
-from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
+from rmpa.web.hub.services import ServedService, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics, MadeOnce
 from rmpa.web.hub.transforms import TransformTree
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
-    from rmpa.web.hub.services import ServedService
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
 _log = logging.getLogger(__name__)
@@ -71,7 +70,7 @@ class Hub:
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
-        self.served = ServedServices(self.link)
+        self.served: dict[str, ServedService] = {}
         self.graph = GraphWatch(self.link, self.calls, self.params.reload)
         self.topics = HubTopics(self.link, self.types, self.graph, time.time_ns)
         self.time = RosTime(self.topics, self.params, time.time_ns)
@@ -110,7 +109,8 @@ class Hub:
         for part in (self.graph, self.params, self.types, self.calls, self.link):
             await part.close()
         self.topics.close()
-        self.served.close()
+        for served in [*self.served.values()]:
+            served.close()
         await self.link.withdrawn()
 
     def values(self, message: ReceivedMessage) -> Any:
@@ -192,7 +192,7 @@ class HubClient:
         differs: Callable[[str], None] = lambda _: None,
     ) -> ClientSubscription:
         """Subscribe to a topic; see ``HubTopics.subscribe``."""
-        subscribed = self.hub.topics.names
+        subscribed = self.hub.topics.subscribed
         if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and topic not in subscribed:
             known = self.hub.graph.topics.get(topic)
             if known is None or not known.publishers:
@@ -205,9 +205,9 @@ class HubClient:
     def advertise(
         self, topic: str, type_: str, failed: Callable[[RmpaError], None], *, latch: bool = False
     ) -> ClientPublication:
-        """Publish a topic; see ``Publishers.advertise``."""
+        """Publish a topic; see ``HubTopics.advertise``."""
         self.check_control("publish")
-        made = self.hub.topics.publishers.advertise(topic, type_, failed, latch=latch, accepts=self._accepts)
+        made = self.hub.topics.advertise(topic, type_, failed, latch=latch, accepts=self._accepts)
         self._open.add(made)
         return made
 
@@ -237,9 +237,10 @@ class HubClient:
         called: Callable[[bytes, asyncio.Future[Payload]], None],
         failed: Callable[[RmpaError], None],
     ) -> ServedService:
-        """Offer a service; see ``ServedServices.serve``."""
+        """Offer a service; see ``ServedService``."""
         self.check_control("offer services")
-        made = self.hub.served.serve(service, self.hub.types.service(type_), called, failed)
+        hub = self.hub
+        made = ServedService(hub.link, hub.served, service, hub.types.service(type_), called, failed)
         self._open.add(made)
         return made
 
@@ -363,7 +364,7 @@ class ClientCounts:
             self._publications = []
             for topic, type_ in _TYPES.items():
                 with contextlib.suppress(PeerRefused):  # a client publishes that topic with another type
-                    made = self._hub.topics.publishers.advertise(topic, type_, self._refused, latch=True)
+                    made = self._hub.topics.advertise(topic, type_, self._refused, latch=True)
                     self._publications.append(made)
         clients = [*self._clients.values()]
         values = {_COUNT: {"data": len(clients)}, _CLIENTS: {"clients": clients}}

@@ -85,9 +85,9 @@ class Stick:
     def advertise(self) -> None:
         """Connect to the other servers, so that they hear the next word at once."""
         if self._publication is None and not self.problem:
-            name, publishers = self.topic + SUFFIX, self._hub.topics.publishers
+            name = self.topic + SUFFIX
             try:
-                self._publication = publishers.advertise(name, _TYPE, self._failed, latch=True)
+                self._publication = self._hub.topics.advertise(name, _TYPE, self._failed, latch=True)
             except RmpaError as error:
                 self._failed(error)
 

@@ -320,7 +320,7 @@ class RosbridgeSession(Session):
 
     def _is_there(self, name: str) -> bool:
         known = self.hub.graph.topics.get(name)
-        is_own = name in self.hub.topics.publishers.names or self._tf.publishes(name)
+        is_own = name in self.hub.topics.published or self._tf.publishes(name)
         return bool(known is not None and known.types) or is_own
 
     def _begin_topic(self, spelling: str, name: str, kind: str | None) -> _Topic:
