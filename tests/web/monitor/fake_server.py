@@ -41,12 +41,11 @@ from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
-from rmpa.web.monitor.driving import TYPES
+from rmpa.web.monitor.driving import TYPES, Sticks
 from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
-from rmpa.web.monitor.sticks import Sticks
 from rmpa.web.server.app import HEADERS
 from tests.web.monitor import wrapped
 from tests.web.monitor.recorded import Recordings

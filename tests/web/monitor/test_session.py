@@ -15,8 +15,8 @@ from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import driving, limits
+from rmpa.web.monitor.driving import Sticks
 from rmpa.web.monitor.session import MonitorSession
-from rmpa.web.monitor.sticks import Sticks
 from tests.web.monitor.patches import apply
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import Asked, FakeHub, PageConnection, Recorded

@@ -16,10 +16,10 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 from rmpa.web import limits as web_limits
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
+from rmpa.web.monitor.driving import Sticks
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import ResourceWatch
 from rmpa.web.monitor.state import StateBuilder, details, steady_entry
-from rmpa.web.monitor.sticks import Sticks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping

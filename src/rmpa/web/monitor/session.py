@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.monitor.driving import Stick
     from rmpa.web.monitor.monitor import Monitor
-    from rmpa.web.monitor.sticks import Stick
 
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
@@ -142,7 +142,6 @@ class MonitorSession(Session):
         self._joystick = Joystick()
         self._driver: Driver | None = None
         self._stick: Stick | None = None
-        self._has_stick = False
         self._publications = PagePublications(self, self._send, self._failed, self._clock)
 
     def opened(self) -> None:
@@ -432,19 +431,18 @@ class MonitorSession(Session):
     def _show_stick(self, topic: str) -> None:
         stick = self._stick
         if stick is not None and stick.topic != topic:
-            self._monitor.sticks.hide(stick, self)
-            self._stick, self._has_stick = None, False
+            self._stick = None
+            stick.hide(self)
         if topic and self._stick is None:
             self._stick = self._monitor.sticks.show(topic, self, self._stick_changed, drives=self._may.drive)
             self._tell_stick(self._stick)
 
-    def _stick_changed(self) -> None:
+    def _stick_changed(self, had: bool) -> None:
         stick = self._stick
         if stick is None:
             return
-        had, self._has_stick = self._has_stick, stick.holder is self
         with self._turn():
-            if had and not self._has_stick:
+            if had and stick.holder is not self:
                 self._joystick.release()
                 self._stop()
                 if stick.hold.ended:
@@ -454,7 +452,7 @@ class MonitorSession(Session):
     def _tell_stick(self, stick: Stick) -> None:
         hold = stick.hold
         holder = {"by": hold.by, "module": hold.module, "since": hold.since} if hold.by else None
-        about = {"holder": holder, "mine": self._has_stick, "problem": stick.problem}
+        about = {"holder": holder, "mine": stick.holder is self, "problem": stick.problem}
         self._send({"op": "stick", "topic": stick.topic, **about})
 
     def op_drive(
