@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 import struct
-import zlib
 from array import array
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,6 +18,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import WatchState, scan
 from rmpa.web.monitor.state import shown_node
+from rmpa.web.pictures import png_chunk, png_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -191,18 +191,10 @@ def _rows(data: memoryview, width: int, height: int, every: int) -> Iterable[byt
 
 def _png(width: int, height: int, rows: Iterable[bytes]) -> bytes:
     """A PNG of levels, whose palette is black of some opacity: the page gives it the colour of its text."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     opacity = bytearray(256)
     for level, shade in enumerate(_OPACITY):
         opacity[(1 << level) - 1] = shade
-    packed = zlib.compressobj(1)
-    data = b"".join([*(packed.compress(b"\0" + row) for row in rows), packed.flush()])
-    head = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
-    palette = chunk(b"PLTE", bytes(768)) + chunk(b"tRNS", bytes(opacity))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + palette + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return png_file(width, height, 3, rows, png_chunk(b"PLTE", bytes(768)) + png_chunk(b"tRNS", bytes(opacity)))
 
 
 # What each type is on a map, and how it is made of its values.

@@ -53,7 +53,6 @@ FRAGMENT_TIMEOUT: Final = 60.0
 # [Rosbridge] Bytes that a `png` unpacks to
 # At it: it is refused
 # Told in: status
-# Why: Its lines may have filters, which are undone in Python.
 PNG_MAX: Final = 4 * MIB
 # [Rosbridge] Subscribed topics
 # At it: further ones are refused

@@ -23,7 +23,7 @@ from rmpa.core.identity import is_global_name
 from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
 from rmpa.web.hub.connection import tune
-from rmpa.web.monitor.messages import compressed_picture, raw_picture
+from rmpa.web.pictures import compressed_picture, pillow, raw_picture
 from rmpa.web.server.access import Problem, guard_of
 
 if TYPE_CHECKING:
@@ -132,24 +132,15 @@ def encode(kind: MessageType, payload: memoryview, wish: Wish) -> tuple[str, byt
         wanted = wish.width or round(wish.height * width / height), wish.height or round(wish.width * height / width)
         size = tuple(min(max(1, each), limits.PICTURE_SIDE_MAX) for each in wanted)
         # Whole pixels are averaged first: a sixth of the time.
-        image = image.resize(size, _pillow().Resampling.BILINEAR, reducing_gap=1.0)
+        image = image.resize(size, pillow().Resampling.BILINEAR, reducing_gap=1.0)
     out = io.BytesIO()
     image.save(out, "JPEG", quality=wish.quality or _QUALITY)
     return "image/jpeg", out.getvalue()
 
 
-def _pillow() -> Any:
-    try:
-        from PIL import Image  # noqa: PLC0415 - 30 ms and 10 MB, of the extra "web"
-    except ImportError:
-        raise RmpaError("raw images need Pillow, which is missing; pip install rmpa[web]") from None
-    return Image
-
-
 def _opened(values: Mapping[str, Any]) -> Any:
-    pillow = _pillow()
     try:
-        image = pillow.open(io.BytesIO(values["data"]), formats=("JPEG", "PNG"))
+        image = pillow().open(io.BytesIO(values["data"]), formats=("JPEG", "PNG"))
         _check_size(*image.size)
         return image.convert("RGB")
     except (OSError, ValueError, SyntaxError) as error:
@@ -164,10 +155,10 @@ def _image(values: Mapping[str, Any]) -> Any:
     data = values["data"]
     if not mode:
         made = raw_picture(width, height, encoding, step, data)
-        return _pillow().frombytes("L", (made.width, made.height), bytes(made.data))
+        return pillow().frombytes("L", (made.width, made.height), bytes(made.data))
     if width <= 0 or height <= 0 or step < width * size or len(data) < step * height:
         raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
-    return _pillow().frombuffer(mode, (width, height), data, "raw", raw, step, 1)
+    return pillow().frombuffer(mode, (width, height), data, "raw", raw, step, 1)
 
 
 def _check_size(width: int, height: int) -> None:
