@@ -23,7 +23,7 @@ from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB, MIB
-from rmpa.runtime.tasks import end_tasks, start_task
+from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
 from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame, size_of
 from rmpa.web.hub.hub import HubClient
@@ -340,7 +340,7 @@ class ClientConnection:
         self._refused = refused
         session = self._session
         session.hub.connect(session)
-        tasks: list[asyncio.Task[None]] = []
+        tasks = OwnedTasks()
         try:
             writer = await socket_.prepare(request)
             self._guard = guard_of(request)
@@ -354,12 +354,11 @@ class ClientConnection:
             self._out = FrameWriter(self._transport, writer.drain)
             socket_.before_close = self._out.hand_over
             session.opened()
-            works = [("write to", self._write(socket_, self._out)), ("watch", self._watch())]
+            tasks.start(self._write(socket_, self._out), f"write to {session.name}")
+            tasks.start(self._watch(), f"watch {session.name}")
             if session.rights.command_age and not session.dates_commands:
                 self._age = CommandAge(self.now())
-                works.append(("ask the age of", self._ask_age(self._age)))
-            for name, work in works:
-                tasks.append(start_task(work, f"{name} {session.name}"))
+                tasks.start(self._ask_age(self._age), f"ask the age of {session.name}")
             await self._read(socket_)
         finally:
             try:
@@ -371,7 +370,7 @@ class ClientConnection:
                 session.hub.disconnect(session)
                 if self._out is not None:
                     self._out.close()
-                await end_tasks(*tasks)
+                await tasks.close()
 
     async def _read(self, socket_: FrameSocket) -> None:
         async for message in socket_:

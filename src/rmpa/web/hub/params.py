@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import functools
 import logging
+import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.master.parameters import Parameters, leaves
@@ -190,6 +191,19 @@ class ParamMirror:
                 told = {name: None if new is MISSING else cast("ParamValue", new) for name, new in news.items()}
             if told:
                 changed(told)
+
+
+def as_json(value: object, binary: Callable[[bytes], str]) -> Any:
+    """A parameter for JSON: what that lacks (NaN, infinities, dates) as text; bytes as ``binary`` makes of them."""
+    if isinstance(value, Mapping):
+        return {str(key): as_json(inner, binary) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(inner, binary) for inner in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return binary(bytes(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
 def _same(one: object, other: object) -> bool:

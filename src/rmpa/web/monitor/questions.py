@@ -7,7 +7,6 @@ import functools
 import hashlib
 import itertools
 import logging
-import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -27,7 +26,7 @@ from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
-from rmpa.web.hub.params import value_at
+from rmpa.web.hub.params import as_json, value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.descriptions import SUFFIX, Descriptions
 from rmpa.web.monitor.driving import TYPES
@@ -305,7 +304,9 @@ class Answers:
         """
         peer = _text(args, "peer")
         tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
-        return _if_new(args, values=self._hub.link.rules.visible_tree(_plain(tree)))
+        return _if_new(
+            args, values=self._hub.link.rules.visible_tree(as_json(tree, lambda data: f"{len(data)} bytes"))
+        )
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -493,16 +494,3 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
-
-
-def _plain(value: object) -> Any:
-    """Parameters for JSON: bytes are shown by their number, dates as they are written."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, bytes | bytearray | memoryview):
-        return f"{len(value)} bytes"
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    return value if value is None or isinstance(value, bool | int | str) else str(value)

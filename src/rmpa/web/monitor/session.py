@@ -132,8 +132,8 @@ class MonitorSession(Session):
         super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), address)
         self._may = rights
         self._monitor = monitor
-        self._clock = clock or asyncio.get_running_loop().time
-        self._opened = self._looked = self._clock()
+        self.clock = clock or asyncio.get_running_loop().time
+        self._opened = self._looked = self.clock()
         self._tick = self._opened + limits.TICK_PERIOD
         self._bucket = TokenBucket(limits.REQUEST_RATE, limits.REQUEST_BURST)
         self._patches = StatePatches(self._opened)
@@ -142,7 +142,7 @@ class MonitorSession(Session):
         self._joystick = Joystick()
         self._driver: Driver | None = None
         self._stick: Stick | None = None
-        self._publications = PagePublications(self, self._send, self._failed, self._clock)
+        self._publications = PagePublications(self)
 
     def opened(self) -> None:
         """Greet the page, and show it the state."""
@@ -150,7 +150,7 @@ class MonitorSession(Session):
         fastest["acceleration"] = limits.DRIVE_ACCELERATION
         may = [right for right in RIGHTS if getattr(self._may, right)]
         about = {"agent": self._monitor.module, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
-        self._send({"op": "hello", "version": VERSION, "at": self._opened, **about})
+        self.send({"op": "hello", "version": VERSION, "at": self._opened, **about})
         self._monitor.follow(self, self._update)
 
     def closing(self) -> None:
@@ -178,7 +178,7 @@ class MonitorSession(Session):
             try:
                 getattr(self, type(message).__name__)(now, **fields)
             except RmpaError as error:
-                self._failed(fields.get("id", 0), error)
+                self.failed(fields.get("id", 0), error)
             self.handle_timer(now)
 
     def _malformed(self, text: str, refusal: str = "message") -> None:
@@ -191,7 +191,7 @@ class MonitorSession(Session):
         """When something is due that the page waits for, or the robot must be stopped."""
         dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due, self._publications.due]
         if self._stick is not None and (wait := self._stick.due(self)) is not None:
-            dues.append(self._clock() + wait)
+            dues.append(self.clock() + wait)
         if self.connection.unsent == 0:
             dues += [watch.due(0.0) for watch in self._watches.values()]
         elif self._watches:
@@ -208,13 +208,13 @@ class MonitorSession(Session):
                 self._stick.handle_timer(self)
             self._publications.handle_timer(now)
             if (news := self._patches.take(now, self._monitor.details)) is not None:
-                self._send(news)
+                self.send(news)
             self._flush(now)
             if now >= self._tick:
                 self._tick = now + limits.TICK_PERIOD
                 if self.connection.unsent == 0:
                     # Scripts do not see WebSocket's pings: a page that misses ticks takes the connection for lost.
-                    self._send({"op": "tick", "at": now})
+                    self.send({"op": "tick", "at": now})
 
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:
@@ -226,10 +226,11 @@ class MonitorSession(Session):
             self.connection.end(WSCloseCode.INTERNAL_ERROR, "the server failed; its log says why")
         self.connection.arm()
 
-    def _send(self, message: dict[str, Any]) -> None:
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a message to the page."""
         self.connection.push((Opcode.TEXT, (msgspec.json.encode(message),)))
 
-    def _failed(self, id_: int, error: RmpaError) -> None:
+    def failed(self, id_: int, error: RmpaError) -> None:
         """What the page ordered cannot be done: a watch, a question, or (0) neither."""
         remedy = str(getattr(error, "remedy", ""))
         text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
@@ -237,11 +238,11 @@ class MonitorSession(Session):
         self._refuse(id_, text, remedy, error.code, **field)
 
     def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused", **more: Any) -> None:
-        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
+        self.send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
 
     def _update(self, state: Tree) -> None:
         self._patches.update(state)
-        self.handle_timer(self._clock())
+        self.handle_timer(self.clock())
 
     def op_ack(self, _: float, *, n: int) -> None:
         """The state or patch number ``n`` is shown, and all before it."""
@@ -282,7 +283,7 @@ class MonitorSession(Session):
                     watch.receive(message)
                 except RmpaError as error:
                     self._end_watch(id, error)
-                self._flush(self._clock())
+                self._flush(self.clock())
 
         def failed(error: RmpaError) -> None:
             with self._turn():
@@ -308,7 +309,7 @@ class MonitorSession(Session):
         if watch is not None and watch.subscription is not None:
             watch.subscription.close()
         if error is not None:
-            self._failed(id_, error)
+            self.failed(id_, error)
 
     def _flush(self, now: float) -> None:
         for id_, watch in [*self._watches.items()] if self.connection.unsent == 0 else ():
@@ -321,11 +322,11 @@ class MonitorSession(Session):
                 self._end_watch(id_, error)
             else:
                 if (beat := watch.beat.news()) is not None:
-                    self._send({"op": "beat", "id": id_, **beat})
+                    self.send({"op": "beat", "id": id_, **beat})
                 if isinstance(frame, bytes):
                     self.connection.push((Opcode.BINARY, (frame,)))
                 elif isinstance(frame, dict):
-                    self._send(frame)
+                    self.send(frame)
                 else:
                     self._make(id_, watch, frame)
 
@@ -360,8 +361,8 @@ class MonitorSession(Session):
                     self._questions.discard(id)
                     send(value)
 
-            done = functools.partial(reply, lambda value: self._send({"op": "answer", "id": id, "value": value}))
-            failed = functools.partial(reply, functools.partial(self._failed, id))
+            done = functools.partial(reply, lambda value: self.send({"op": "answer", "id": id, "value": value}))
+            failed = functools.partial(reply, functools.partial(self.failed, id))
             self.run(self._monitor.answers.answer(what, args), done, failed)
 
     def _is_late(self, id_: int, now: float, at: float) -> bool:
@@ -453,7 +454,7 @@ class MonitorSession(Session):
         hold = stick.hold
         holder = {"by": hold.by, "module": hold.module, "since": hold.since} if hold.by else None
         about = {"holder": holder, "mine": stick.holder is self, "problem": stick.problem}
-        self._send({"op": "stick", "topic": stick.topic, **about})
+        self.send({"op": "stick", "topic": stick.topic, **about})
 
     def op_drive(
         self,
@@ -500,7 +501,7 @@ class MonitorSession(Session):
             joystick.release(hold)
         elif joystick.drive(topic, now):
             sent = driver.command(Command(linear, side, angular, axes, buttons), ramp, now)
-            self._send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
+            self.send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
         else:
             driver.arm(now)
 
@@ -531,7 +532,7 @@ class MonitorSession(Session):
 
         def failed(error: RmpaError) -> None:
             self._end_driver()
-            self._failed(0, error)
+            self.failed(0, error)
 
         driver = self._driver
         try:
