@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -183,12 +184,12 @@ class Connection:
         self.queue.pace(stream, interval, length)
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
-        self.queue.push(stream, lambda now: stream.frames(message, now), 1, 0, self._client.now)
+        self.queue.push(stream, functools.partial(stream.frames, message), 1, 0, self._client.now)
         self.flush()
 
     def flush(self) -> None:
         while (entry := self.queue.pop(self._client.now)) is not None:
-            self.sent += entry(self._client.now)
+            self.sent += entry()
 
     def end(self, code: int, _reason: str, _refusal: str = "") -> None:
         self.ended.append(code)

@@ -327,7 +327,7 @@ async def forever() -> None:
 
 async def watched(transport: Transport) -> None:
     hub: Any = None
-    connection = Silent(hub, READ_ONLY, lambda _: 0, "here").connection
+    connection = Silent(hub, READ_ONLY, "here").connection
     played: Any = transport
     connection._transport = played
     connection._out = FrameWriter(played, forever)

@@ -538,7 +538,7 @@ class _Client(Recorded):
         hub: Any = FakeHub()
         hub.values = self._decode
         address = f"10.0.0.{next(server.pages)}"
-        super().__init__(MonitorSession(hub, server.rights, lambda _: 0, address, monitor, time.monotonic))
+        super().__init__(MonitorSession(hub, server.rights, address, monitor, time.monotonic))
         self.page = self.connection = self.session.connection = PageConnection(self)
 
     def _decode(self, message: ReceivedMessage) -> Any:

@@ -49,7 +49,7 @@ class Page(Recorded):
         )
         hub: Any = FakeHub()
         hub.values = self._decode
-        super().__init__(MonitorSession(hub, rights, lambda _: 0, "page", monitor, lambda: self.now))
+        super().__init__(MonitorSession(hub, rights, "page", monitor, lambda: self.now))
         self.now = 100.0
         self.page = self.connection = self.session.connection = PageConnection(self)
         self.session.opened()

@@ -19,7 +19,7 @@ class Client(Recorded):
         self.hub = FakeHub()
         self.graph = self.hub.graph
         hub: Any = self.hub
-        super().__init__(RosbridgeSession(hub, FULL, lambda _: 0, "here"))
+        super().__init__(RosbridgeSession(hub, FULL, "here"))
 
     def send(self, op: str, **values: Any) -> list[Asked]:
         return self.send_raw(msgspec.json.encode({"op": op, **values}).decode())
