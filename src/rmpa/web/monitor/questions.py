@@ -158,15 +158,18 @@ class Answers:
         known = ("modules", "after", "level", "node", "since", "most")
         found = await self.ask_agent("log", **{key: args[key] for key in known if key in args})
         for module in found:
-            lines = module.get("lines", ())
-            nodes = {line["node"] for line in lines}
-            hidden = {node: why for node in nodes if (why := self._denied(Access.LOG, node))}
-            module["lines"] = [line for line in lines if line["node"] not in hidden]
+            self._hide(module, "lines", Access.LOG, lambda line: line["node"])
             for line in module["lines"]:
                 line["text"] = cut_text(line["text"], limits.LOG_CHARACTERS)
-            if hidden and not module["lines"]:
-                module["problem"] = next(iter(hidden.values()))
         return found
+
+    def _hide(self, module: Args, what: str, access: Access, name_of: Callable[[Args], str]) -> None:
+        """Leave out what the rules let no page see of a module; where nothing is left, its ``problem`` says why."""
+        told = [(name_of(each), each) for each in module.get(what, ())]
+        denied = {name: why for name in dict(told) if (why := self._denied(access, name))}
+        module[what] = [each for name, each in told if name not in denied]
+        if denied and not module[what]:
+            module["problem"] = next(iter(denied.values()))
 
     def _denied(self, access: Access, name: str) -> str:
         """Why a page may not do that with what has this name; empty: it may."""
@@ -187,10 +190,7 @@ class Answers:
         """The resources that each module can start, with their processes; those that the rules let a page start."""
         found = await self.ask_agent("launch", what="list")
         for module in found:
-            judged = [(each, self._denied(Access.LAUNCH, f"/{each['name']}")) for each in module["resources"]]
-            module["resources"] = [each for each, why in judged if not why]
-            if judged and not module["resources"]:
-                module["problem"] = judged[0][1]
+            self._hide(module, "resources", Access.LAUNCH, lambda each: f"/{each['name']}")
         return found
 
     async def _top(self, _args: Args) -> Any:
