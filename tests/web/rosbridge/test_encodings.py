@@ -135,8 +135,11 @@ def test_pictures_of_another_encoder_are_read(mode: str, data: st.DataObject) ->
     assert decode_png(base64.b64encode(file.getvalue()).decode()) == raw.decode()
 
 
-def _picture(lines: bytes, width: int, height: int, *, bits: int = 8, packed: bytes | None = None) -> str:
-    raw = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0))
+def _picture(
+    lines: bytes, width: int, height: int, *, bits: int = 8, packed: bytes | None = None, more: bytes = b""
+) -> str:
+    head = struct.pack(">IIBBBBB", width, height, bits, 2, 0, 0, 0)
+    raw = b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", head) + more
     raw += png_chunk(b"IDAT", zlib.compress(lines) if packed is None else packed)
     return base64.b64encode(raw + png_chunk(b"IEND", b"")).decode()
 
@@ -152,6 +155,11 @@ def _picture(lines: bytes, width: int, height: int, *, bits: int = 8, packed: by
         (_picture(b"", 1, 1, packed=b"nonsense"), "unpacked"),
         (_picture(bytes(4), 2, 1), "unpacked"),
         (_picture(b"\x05abc", 1, 1), "unpacked"),
+        # Another header, of a larger picture, behind the one that is bounded.
+        (
+            _picture(b"", 1, 1, more=png_chunk(b"IHDR", struct.pack(">IIBBBBB", 9000, 9000, 8, 2, 0, 0, 0))),
+            "unpacked",
+        ),
         (_picture(b"\x00\xff\xff\xff", 1, 1), "UTF-8"),
     ],
 )
