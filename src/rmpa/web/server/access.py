@@ -80,39 +80,9 @@ class Problem(Exception):  # noqa: N818 - the word of RFC 9457
         return msgspec.json.encode({"title": _TITLES[self.status], "status": self.status, "detail": self.detail})
 
 
-@dataclass(frozen=True, slots=True)
-class RequestFacts:
-    """What the decision is made of. ``None`` is a header that is missing.
-
-    Attributes:
-        host: All ``Host`` headers; HTTP/1.1 has exactly one.
-        origin: ``Origin``.
-        fetch_site: ``Sec-Fetch-Site``, which pages cannot set.
-        fetch_mode: ``Sec-Fetch-Mode``.
-        authorization: ``Authorization``.
-        cookie: The value of the token's cookie.
-        token: The query's ``token``.
-        is_page: Whether the path is a page for people, for which a cookie is set.
-        is_open: Whether the path needs no token.
-        is_picture: Whether the path gives pictures, which other sites' pages show by ``<img>``.
-        is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
-        secure: Whether it came by HTTPS.
-    """
-
-    host: tuple[str, ...]
-    origin: str | None = None
-    fetch_site: str | None = None
-    fetch_mode: str | None = None
-    authorization: str | None = None
-    cookie: str | None = None
-    token: str | None = None
-    is_page: bool = False
-    is_open: bool = False
-    is_picture: bool = False
-    is_preflight: bool = False
-    secure: bool = False
-
-
+# What stands at a path: ``page``: for people, and a cookie is set for it; ``open``: it needs no token; ``pictures``,
+# which other sites' pages show by ``<img>``; or anything else.
+Place: TypeAlias = Literal["page", "open", "pictures", ""]
 # ``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
 # browser is told what pages of a listed site may send.
 Verdict: TypeAlias = Literal["granted", "move token", "preflight"]
@@ -139,57 +109,66 @@ class AccessPolicy:
         """The name of the token's cookie."""
         return f"rmpa_token_{self.port}"
 
-    def judge(self, request: RequestFacts) -> Verdict:
+    def judge(self, request: web.BaseRequest, place: Place = "", *, shared: bool = True) -> Verdict:
         """The decision about a request.
+
+        Args:
+            request: The request.
+            place: What it asks for.
+            shared: Whether pages of listed sites may read that.
 
         Raises:
             Problem: It is not served, for its ``host``, ``origin`` or ``token``.
         """
         self._check_host(request)
-        self._check_origin(request)
-        if request.is_preflight and self.lists(request.origin):
+        self._check_origin(request, place)
+        is_preflight = request.method == "OPTIONS" and "Access-Control-Request-Method" in request.headers
+        if is_preflight and shared and self.lists(request.headers.get("Origin")):
             return "preflight"
-        return self._by_token(request)
+        return self._by_token(request, place)
 
     def lists(self, origin: str | None) -> bool:
         """Whether an ``Origin`` is one of ``origins``; ``*`` never is."""
         return origin is not None and origin != "*" and origin.lower() in self.origins
 
-    def _check_host(self, request: RequestFacts) -> None:
-        if len(request.host) != 1:
-            raise Problem(400, f"the request has {len(request.host)} Host headers; send exactly one", "host")
-        host = request.host[0]
-        name = host_name(host)
+    def _check_host(self, request: web.BaseRequest) -> None:
+        hosts = request.headers.getall("Host", ())
+        if len(hosts) != 1:
+            raise Problem(400, f"the request has {len(hosts)} Host headers; send exactly one", "host")
+        name = host_name(hosts[0])
         if name is None or not (is_address(name) or name in self.hosts):
             remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
-            raise Problem(403, f"{_short(host)} is no name of this server; {remedy}", "host")
+            raise Problem(403, f"{_short(hosts[0])} is no name of this server; {remedy}", "host")
 
-    def _check_origin(self, request: RequestFacts) -> None:
-        if request.origin is not None:
-            scheme, _, rest = request.origin.partition("://")
+    def _check_origin(self, request: web.BaseRequest, place: Place) -> None:
+        headers = request.headers
+        origin = headers.get("Origin")
+        if origin is not None:
+            scheme, _, rest = origin.partition("://")
             # A page of plain HTTP may be forged on its way, so it is no page of a server of HTTPS. A server of plain
             # HTTP may be behind a proxy that ends TLS: its own pages are then of HTTPS.
             schemes = ("https",) if request.secure else ("http", "https")
-            if not ((scheme in schemes and rest.lower() == request.host[0].lower()) or self.lists(request.origin)):
-                raise _foreign(_short(request.origin))
+            if not ((scheme in schemes and rest.lower() == headers["Host"].lower()) or self.lists(origin)):
+                raise _foreign(_short(origin))
             return
-        elsewhere = request.fetch_site in ("cross-site", "same-site")
         # Only the token in the URL counts: a browser sends a cookie with requests of any site.
-        if request.is_picture and self.token and self._fits(request.token):
+        if place == "pictures" and self.token and self._fits(request.query.get(TOKEN_PARAMETER)):
             return
         # A link on another page may lead here: the browser shows the page, and the other page cannot read it.
-        if elsewhere and not (request.fetch_mode == "navigate" and request.is_page):
+        leads = place == "page" and headers.get("Sec-Fetch-Mode") == "navigate"
+        if headers.get("Sec-Fetch-Site") in ("cross-site", "same-site") and not leads:
             raise _foreign("another site")
 
-    def _by_token(self, request: RequestFacts) -> Verdict:
-        if not self.token or request.is_open:
+    def _by_token(self, request: web.BaseRequest, place: Place) -> Verdict:
+        if not self.token or place == "open":
             return "granted"
-        if self._fits(request.token):
-            return "move token" if request.is_page else "granted"
-        given = (bearer(request.authorization), request.cookie)
+        asked = request.query.get(TOKEN_PARAMETER)
+        if self._fits(asked):
+            return "move token" if place == "page" else "granted"
+        given = (bearer(request.headers.get("Authorization")), request.cookies.get(self.cookie))
         if any(map(self._fits, given)):
             return "granted"
-        is_given = any(each is not None for each in (request.token, *given))
+        is_given = any(each is not None for each in (asked, *given))
         problem = "the token is wrong" if is_given else "this server needs a token"
         remedy = "send it as Authorization: Bearer TOKEN or as ?token=TOKEN"
         raise Problem(401, f"{problem}; {remedy}; rmpa web says at its start where the token is", "token")

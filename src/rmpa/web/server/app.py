@@ -29,7 +29,6 @@ from rmpa.web.server.access import (
     ConnectionPhase,
     ConnectionTable,
     Problem,
-    RequestFacts,
     guard_of,
     host_name,
     is_loopback,
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from aiohttp.typedefs import Handler
 
     from rmpa.web.clients import WebSocketClients
+    from rmpa.web.server.access import Place
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.recordings import RecordingFiles
     from rmpa.web.server.video import VideoStreams
@@ -270,7 +270,8 @@ class WebServer:
             response.headers.update((OPENER_POLICY,))
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        verdict = self._policy.judge(self._facts(request))
+        shared = request.path not in self._pages
+        verdict = self._policy.judge(request, self._place(request), shared=shared)
         if request.method not in _METHODS and verdict != "preflight":
             text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
             raise Problem(405, text, "method")
@@ -290,25 +291,15 @@ class WebServer:
             sockets.refuse(request.remote or "?", "handshake", text)
             raise Problem(400, f"not the handshake of a WebSocket: {text}") from None
 
-    def _facts(self, request: web.Request) -> RequestFacts:
-        headers, path = request.headers, request.path
-        content_type = self._pages[path][1] if path in self._pages and not is_upgrade(request) else ""
-        return RequestFacts(
-            host=tuple(headers.getall("Host", ())),
-            origin=headers.get("Origin"),
-            fetch_site=headers.get("Sec-Fetch-Site"),
-            fetch_mode=headers.get("Sec-Fetch-Mode"),
-            authorization=headers.get("Authorization"),
-            cookie=request.cookies.get(self._policy.cookie),
-            token=request.query.get(TOKEN_PARAMETER),
-            is_page=content_type.startswith("text/html") or (path == VIEWER and self._video is not None),
-            is_picture=path in PICTURES,
-            is_open=request.path == _HEALTH,
-            is_preflight=request.method == "OPTIONS"
-            and "Access-Control-Request-Method" in headers
-            and request.path not in self._pages,
-            secure=request.secure,
-        )
+    def _place(self, request: web.Request) -> Place:
+        path = request.path
+        if path == _HEALTH:
+            return "open"
+        if path in PICTURES:
+            return "pictures"
+        _, content_type = self._pages.get(path, (b"", ""))
+        is_page = content_type.startswith("text/html") and not is_upgrade(request)
+        return "page" if is_page or (path == VIEWER and self._video is not None) else ""
 
     def _sharing(self, request: web.Request) -> dict[str, str]:
         """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
