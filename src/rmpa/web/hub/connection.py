@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # Pings without an answer, behind which no further one is sent: they wait as the client's frames do.
 _UNANSWERED_MAX: Final = 8
-# Bytes of a client's control frame before its payload: two, and the mask.
-_CONTROL_HEADER: Final = 6
 # Bytes that an entry of the queue takes beside its payload.
 _OVERHEAD: Final = 128
 # Entries that are written before other tasks have their turn.
@@ -156,48 +154,6 @@ class ClientStream:
         """The frames of a message; called when the connection can take them."""
 
 
-class MessageArrival:
-    """Finds a message that never ends. A byte too few may be counted for it, and never one too many.
-
-    The library gathers the bytes and fragments of a message (RFC 6455, section 5.4) and passes only whole ones on.
-    What a connection received beyond the whole ones belongs to a message that is not whole yet.
-    """
-
-    def __init__(self) -> None:
-        self._accounted = 0
-        self._began: float | None = None
-
-    def message_ended(self, received: int) -> None:
-        """A message is whole.
-
-        Args:
-            received: Bytes of the connection so far.
-        """
-        self._accounted = received
-        self._began = None
-
-    def control_frame(self, size: int) -> None:
-        """A ping or pong is whole, which may come between the fragments of a message.
-
-        Args:
-            size: Bytes of its payload.
-        """
-        self._accounted += _CONTROL_HEADER + size
-
-    def takes_too_long(self, received: int, now: float) -> bool:
-        """Whether a message has been arriving for ``limits.MESSAGE_TIMEOUT``; to be asked every few seconds.
-
-        Args:
-            received: Bytes of the connection so far.
-            now: Seconds of a clock that never goes back.
-        """
-        if received <= self._accounted:
-            self._began = None
-        elif self._began is None:
-            self._began = now
-        return self._began is not None and now - self._began >= limits.MESSAGE_TIMEOUT
-
-
 class CommandAge:
     """Bounds the age of what a client sends by the pings that it answers; no clocks are compared.
 
@@ -251,7 +207,6 @@ class ClientConnection:
         self.sent = 0
         self._heard = 0
         self._guard: GuardedConnection | None = None
-        self._arrival = MessageArrival()
         self._age: CommandAge | None = None
         self._wake = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
@@ -316,11 +271,6 @@ class ClientConnection:
         """Bytes that wait, here and behind the queue."""
         return self.queue.bytes + self._waiting
 
-    @property
-    def _received(self) -> int:
-        """Bytes that the client has sent; 0 where they are not counted."""
-        return self._guard.received if self._guard is not None else 0
-
     async def run(
         self,
         request: web.Request,
@@ -346,7 +296,6 @@ class ClientConnection:
             self._guard = guard_of(request)
             if self._guard is not None:
                 self._guard.upgrade(self.unmasked)
-            self._arrival.message_ended(self._received)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -379,10 +328,6 @@ class ClientConnection:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
             if message.type == WSMsgType.PONG and self._age is not None:
                 self._age.pong(bytes(message.data))
-            if message.type in (WSMsgType.PING, WSMsgType.PONG):
-                self._arrival.control_frame(len(message.data))
-            else:
-                self._arrival.message_ended(self._received)
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -419,8 +364,9 @@ class ClientConnection:
         silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now, received = self._waiting, self._received
-            if self._arrival.takes_too_long(received, self.now()):
+            now, guard = self._waiting, self._guard
+            received, since = (guard.received, guard.frames.since) if guard is not None else (0, None)
+            if since is not None and self.now() - since >= limits.MESSAGE_TIMEOUT:
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return
             alive = (self._heard, received) != heard or (waiting and now != waiting)

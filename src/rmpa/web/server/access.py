@@ -305,19 +305,28 @@ class ConnectionTable:
             connection.abort()
 
 
+# Bits of the first byte of a frame, and of the second one.
+_LAST, _CONTROL = 0x80, 0x08
 _MASKED: Final = 0x80
 _MASK_BYTES: Final = 4
 
 
-class MaskCheck:
-    """Finds a frame of a client that is not masked, which the library takes (RFC 6455, section 5.1)."""
+class FrameCheck:
+    """Follows the frames of a client: the library takes some without a mask, and does not tell of half a message.
+
+    A message may come in fragments, and control frames between them (RFC 6455, sections 5.1 and 5.4).
+    """
 
     def __init__(self) -> None:
         self._header = bytearray()
         # Bytes of the frame's payload that are still to come, its mask included.
         self._payload = 0
+        # Whether a message ends with the frame.
+        self._ends = False
+        # Since when a message has been arriving; ``None``: none is.
+        self.since: float | None = None
 
-    def passes(self, data: bytes) -> bool:
+    def passes(self, data: bytes, now: float) -> bool:
         """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
         at = 0
         while at < len(data):
@@ -325,9 +334,15 @@ class MaskCheck:
                 taken = min(self._payload, len(data) - at)
                 self._payload -= taken
                 at += taken
+                if not self._payload and self._ends:
+                    self.since = None
                 continue
             self._header.append(data[at])
             at += 1
+            if len(self._header) == 1:
+                self._ends = self._header[0] & (_LAST | _CONTROL) == _LAST
+                if self.since is None and not self._header[0] & _CONTROL:
+                    self.since = now
             length = self._header[1] & ~_MASKED if len(self._header) > 1 else 0
             if len(self._header) == 2 and not self._header[1] & _MASKED:
                 return False
@@ -363,10 +378,11 @@ class GuardedConnection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._since_response = 0
-        self._mask = MaskCheck()
         self._on_unmasked: Callable[[], None] | None = None
         self._on_lost: Callable[[], None] = lambda: None
         self.phase = ConnectionPhase.IDLE
+        # Of a WebSocket.
+        self.frames = FrameCheck()
         # Bytes of the client so far.
         self.received = 0
 
@@ -413,7 +429,7 @@ class GuardedConnection(asyncio.Protocol):
         if self.phase is ConnectionPhase.UPGRADED:
             if self._on_unmasked is None:
                 return
-            if not self._mask.passes(data):
+            if not self.frames.passes(data, self._loop.time()):
                 self._on_unmasked()
                 self._on_unmasked = None
                 return
