@@ -43,15 +43,7 @@ class Joystick:
         self._hold = 0
         self._number = 0
         self._released = 0
-        self._until = 0.0
         self._told_late = False
-        # The topic that is driven; empty while the robot is stopped.
-        self.topic = ""
-
-    @property
-    def due(self) -> float | None:
-        """When the robot is to be stopped, if no further command comes."""
-        return self._until if self.topic else None
 
     def takes(self, hold: int, n: int, at: float, now: float) -> bool:
         """Whether a command is to be obeyed: it is not too old, and of the present hold or a later one."""
@@ -62,15 +54,6 @@ class Joystick:
         self._hold, self._number = hold, n
         self._told_late = False
         return True
-
-    def drive(self, topic: str, now: float) -> bool:
-        """A command is obeyed; returns whether it may move the robot.
-
-        The first one after a stop only arms: one command alone, whatever kept it, moves nothing.
-        """
-        armed, self.topic = self.topic == topic, topic
-        self._until = now + limits.DRIVE_TIMEOUT
-        return armed
 
     def is_new_late(self, at: float, now: float) -> bool:
         """Whether a refused command is the first since the last obeyed one that came too late."""
@@ -169,15 +152,14 @@ class Driver:
         self._time = client.hub.time
         self._last = Command()
         self._at = 0.0
+        # When the robot is to be stopped, if no further command comes; ``None``: it is stopped.
+        self.due: float | None = None
         self._publication = client.advertise(topic, type_, failed)
 
-    def arm(self, now: float) -> None:
-        """The stick is held: the next command drives."""
-        self.stop()
-        self._at = now
-
-    def command(self, wanted: Command, ramp: float, now: float) -> Command:
+    def command(self, wanted: Command, ramp: float, now: float) -> Command | None:
         """Publish a command; returns what is commanded.
+
+        The first one after a stop only arms (``None``): one command alone, whatever kept it, moves nothing.
 
         Args:
             wanted: What the page asks for.
@@ -186,6 +168,11 @@ class Driver:
         """
         step = ramp / limits.DRIVE_SPEED * min(now - self._at, limits.DRIVE_TIMEOUT)
         last, self._at = self._last, now
+        if self.due is None:
+            self.stop()
+            self.due = now + limits.DRIVE_TIMEOUT
+            return None
+        self.due = now + limits.DRIVE_TIMEOUT
         self._last = wanted._replace(
             linear=ramped(last.linear, wanted.linear, step),
             side=ramped(last.side, wanted.side, step),
@@ -196,6 +183,7 @@ class Driver:
 
     def stop(self) -> None:
         """Publish zeros, at once."""
+        self.due = None
         last = self._last
         self._last = Command(axes=(0.0,) * len(last.axes), buttons=(False,) * len(last.buttons))
         self._publish()

@@ -189,7 +189,9 @@ class MonitorSession(Session):
 
     def next_timer(self) -> float | None:
         """When something is due that the page waits for, or the robot must be stopped."""
-        dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due, self._publications.due]
+        dues: list[float | None] = [self._tick, self._patches.due, self._publications.due]
+        if self._driver is not None:
+            dues.append(self._driver.due)
         if self._stick is not None and (wait := self._stick.due(self)) is not None:
             dues.append(self.clock() + wait)
         if self.connection.unsent == 0:
@@ -201,7 +203,7 @@ class MonitorSession(Session):
     def handle_timer(self, now: float) -> None:
         """Send what is due, and stop a robot that no page commands any more."""
         self._looked = now
-        if self._joystick.due is not None and now >= self._joystick.due:
+        if self._driver is not None and self._driver.due is not None and now >= self._driver.due:
             self._stop()
         with self._turn():
             if self._stick is not None:
@@ -488,7 +490,7 @@ class MonitorSession(Session):
                 late = f"commands reach the server {now - at:.1f} s late, and are dropped"
                 self._refuse(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is", hold=hold)
             return
-        if joystick.topic != topic:
+        if self._driver is not None and self._driver.topic != topic:
             self._stop()
         self._show_stick(topic)
         assert self._stick is not None  # noqa: S101 - shown just now
@@ -499,11 +501,8 @@ class MonitorSession(Session):
             raise
         if (driver := self._driver_of(topic, type)) is None:
             joystick.release(hold)
-        elif joystick.drive(topic, now):
-            sent = driver.command(Command(linear, side, angular, axes, buttons), ramp, now)
+        elif (sent := driver.command(Command(linear, side, angular, axes, buttons), ramp, now)) is not None:
             self.send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
-        else:
-            driver.arm(now)
 
     def op_release(self, _: float, *, hold: int) -> None:
         """The joystick is let go: the robot is stopped at once, and nothing more of that hold drives it."""
@@ -511,8 +510,7 @@ class MonitorSession(Session):
         self._stop()
 
     def _stop(self) -> None:
-        topic, self._joystick.topic = self._joystick.topic, ""
-        if topic and self._driver is not None and self._driver.topic == topic:
+        if self._driver is not None and self._driver.due is not None:
             self._driver.stop()
 
     def _end_driver(self) -> None:
