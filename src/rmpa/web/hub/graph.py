@@ -424,8 +424,7 @@ class GraphWatch(GraphTable):
 
     def follow(self, changed: Callable[[], None]) -> Follower:
         """Call ``changed`` at each change; now, too, where the graph is known."""
-        follower = Follower(self._followers)
-        self._followers[follower] = changed
+        follower = Follower(self._followers, changed)
         if self.loaded.is_set():
             changed()
         return follower

@@ -105,9 +105,7 @@ class ParamMirror:
 
     def follow(self, names: tuple[str, ...], changed: Callable[[Mapping[str, ParamValue]], None]) -> Follower:
         """Call ``changed`` with each change of ``names``, or of all; ``None`` is a parameter that was deleted."""
-        follower = Follower(self._followers)
-        self._followers[follower] = names, changed
-        return follower
+        return Follower(self._followers, (names, changed))
 
     def reload(self) -> None:
         """Read everything anew: the master was away."""

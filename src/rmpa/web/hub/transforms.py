@@ -102,9 +102,7 @@ class TransformTree:
             self._places.clear()
             for topic in TOPICS:
                 self._subscriptions.append(self._topics.subscribe(topic, None, self.take, self._failed))
-        follower = Follower(self._followers)
-        self._followers[follower] = failed
-        return follower
+        return Follower(self._followers, failed)
 
     def rest(self) -> None:
         """Unsubscribe where no follower is left."""

@@ -108,9 +108,7 @@ class TfRepublisher:
 
     def subscribe(self, topic: str, receive: Callable[[ReceivedMessage], None]) -> Follower:
         """Subscribe to a topic of ``publishes``."""
-        made = Follower(self._streams)
-        self._streams[made] = topic, receive
-        return made
+        return Follower(self._streams, (topic, receive))
 
     def call(self, arguments: Any, now: float) -> Values:
         """Answer ``/republish_tfs``."""
