@@ -17,7 +17,6 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
-import logging
 import os
 import re
 import secrets
@@ -29,7 +28,6 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias, cast
 import msgspec
 
 from rmpa.core.errors import StartError
-from rmpa.core.log import RefusalLog
 from rmpa.web import limits
 
 if TYPE_CHECKING:
@@ -38,9 +36,8 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from rmpa.core.statistics import Counters
+    from rmpa.core.log import RefusalLog
 
-_log = logging.getLogger(__name__)
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
@@ -272,12 +269,12 @@ class ConnectionTable:
 
     Args:
         make_protocol: Makes aiohttp's protocol of a new connection.
-        counters: Counts what is closed, by its reason (``api.REFUSALS``).
+        refusals: Counts and tells what is closed, by its reason (``api.REFUSALS``).
     """
 
-    def __init__(self, make_protocol: Callable[[], asyncio.Protocol], counters: Counters) -> None:
+    def __init__(self, make_protocol: Callable[[], asyncio.Protocol], refusals: RefusalLog) -> None:
         self._make_protocol = make_protocol
-        self.refusals = RefusalLog(_log, counters)
+        self.refusals = refusals
         # The connections, the idlest first.
         self.open: dict[GuardedConnection, None] = {}
         # Connections so far.

@@ -195,7 +195,7 @@ class WebServer:
         )
         await runner.setup()
         assert runner.server is not None, "setup() makes it"  # noqa: S101 - for the type checker
-        self._table = ConnectionTable(runner.server, self.counters)
+        self._table = ConnectionTable(runner.server, self._refusals)
         for host, port in self._addresses:
             try:
                 server = await asyncio.get_running_loop().create_server(
