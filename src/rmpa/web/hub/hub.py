@@ -19,7 +19,7 @@ from rmpa.web import limits
 from rmpa.web.hub.frame_writer import size_of
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
-from rmpa.web.hub.params import ParamMirror, RosTime, value_at
+from rmpa.web.hub.params import ParamMirror, RosTime, ros_time, value_at
 from rmpa.web.hub.services import ServedService, ServiceCalls, read_asset
 from rmpa.web.hub.topics import HubTopics, MadeOnce
 from rmpa.web.hub.transforms import TransformTree
@@ -40,7 +40,6 @@ _WHO: Final = "the web server"
 _COUNT: Final = "/client_count"
 _CLIENTS: Final = "/connected_clients"
 _TYPES: Final = {_COUNT: "std_msgs/Int32", _CLIENTS: "rosbridge_msgs/ConnectedClients"}
-_NANO: Final = 1_000_000_000
 _PRIORITIES: Final = {Priority.HIGH: 1, Priority.NORMAL: 0, Priority.LOW: -1}
 
 
@@ -72,9 +71,9 @@ class Hub:
         self.calls = ServiceCalls(self.link)
         self.served: dict[str, ServedService] = {}
         self.graph = GraphWatch(self.link, self.calls, self.params.reload)
-        self.topics = HubTopics(self.link, self.types, self.graph, time.time_ns)
-        self.time = RosTime(self.topics, self.params, time.time_ns)
-        self.counts = ClientCounts(self, time.time_ns)
+        self.topics = HubTopics(self.link, self.types, self.graph)
+        self.time = RosTime(self.topics, self.params)
+        self.counts = ClientCounts(self)
         # What rosbridge's clients are sent.
         self.frames: MadeOnce[OutFrame] = MadeOnce(limits.FRAMES_KEPT_BYTES, size_of)
         self._values: MadeOnce[Any] = MadeOnce(limits.VALUES_KEPT_BYTES)
@@ -264,7 +263,7 @@ class HubClient:
         """The values of ``names`` that are there; without names those of all parameters."""
         self._check_view("read parameters")
         await self.hub.params.loaded.wait()
-        return self.hub.link.rules.visible(self.hub.params.values(names, "/"))
+        return self.hub.link.rules.visible(self.hub.params.values(names))
 
     def set_param(self, name: str, value: ParamValue) -> Coroutine[Any, Any, None]:
         """Set a parameter; see ``ParamMirror.set``."""
@@ -338,20 +337,16 @@ class ClientCounts:
 
     Args:
         hub: Publishes them.
-        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, hub: Hub, now_ns: Callable[[], int]) -> None:
+    def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._now_ns = now_ns
         self._clients: dict[HubClient, dict[str, Any]] = {}
         self._publications: list[ClientPublication] | None = None
 
     def add(self, client: HubClient, address: str) -> None:
         """A client is there."""
-        seconds, nanoseconds = divmod(self._now_ns(), _NANO)
-        time = {"secs": seconds, "nsecs": nanoseconds}
-        self._clients[client] = {"ip_address": address, "connection_time": time}
+        self._clients[client] = {"ip_address": address, "connection_time": ros_time(time.time_ns())}
         self._publish()
 
     def remove(self, client: HubClient) -> None:

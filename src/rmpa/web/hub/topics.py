@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 import weakref
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
@@ -262,14 +263,12 @@ class HubTopics:
         link: Has the node.
         types: Is told the headers of publishers, and knows the types.
         graph: Likewise, and the topics.
-        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, link: NodeLink, types: TypeLibrary, graph: GraphWatch, now_ns: Callable[[], int]) -> None:
+    def __init__(self, link: NodeLink, types: TypeLibrary, graph: GraphWatch) -> None:
         self.link = link
         self.types = types
         self.graph = graph
-        self.now_ns = now_ns
         # The topics that are subscribed to, those included that linger.
         self.subscribed: dict[str, _Topic] = {}
         # The published topics, those included that wait for their withdrawal.
@@ -432,7 +431,7 @@ class _Topic(_Shared[ClientSubscription]):
         if not self.is_there:
             return  # it has ended, and is being withdrawn
         topics = self._topics
-        stamp_ns = topics.now_ns()
+        stamp_ns = time.time_ns()
         source, type_ = header.get("callerid", "?"), header.get("type", "")
         if self._headers.get(source) is not header:
             self._headers[source] = header
@@ -515,7 +514,7 @@ class _Publisher(_Shared[ClientPublication]):
             self._wait(payload)  # it is numbered and delivered when the type is known
             return
         payload = self._numbers.stamp(payload)
-        message = ReceivedMessage(self.name, self.type, memoryview(payload), self._topics.now_ns())
+        message = ReceivedMessage(self.name, self.type, memoryview(payload), time.time_ns())
         if self.latch:
             self.latched = message
         if self._early is not None or self.registration.value is None:

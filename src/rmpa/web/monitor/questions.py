@@ -315,7 +315,7 @@ class Answers:
 
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
-        names = islice(self._hub.params.values((), "/"), 5000)
+        names = islice(self._hub.params.values(), 5000)
         return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
     async def _set_param(self, args: Args) -> Any:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web.hub.node_link import Follower
+from rmpa.web.hub.params import ros_time
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.hub.transforms import Transform, frame_name
 from rmpa.web.rosbridge import limits
@@ -221,7 +222,7 @@ class TfRepublisher:
 
     def _moved(self, request: _Request) -> list[Values]:
         tree, rows = self._client.hub.transforms, []
-        secs, nsecs = divmod(self._client.hub.time.now_ns(), 1_000_000_000)
+        stamp = ros_time(self._client.hub.time.now_ns())
         for frame in request.frames:
             place, last = tree.lookup(request.target, frame), request.sent.get(frame)
             if place is None or (
@@ -232,7 +233,7 @@ class TfRepublisher:
             ):
                 continue
             request.sent[frame] = place
-            header = {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": request.target}
+            header = {"stamp": stamp, "frame_id": request.target}
             rows.append({"header": header, "child_frame_id": frame, "transform": place.values()})
         return rows
 
