@@ -131,7 +131,7 @@ def png_file(width: int, height: int, colour: int, rows: Iterable[bytes], before
     Args:
         width: Pixels.
         height: Pixels.
-        colour: Its type: 2: RGB; 3: of a palette.
+        colour: Its type: 0: grey; 2: RGB; 3: of a palette.
         rows: From the top; they are packed one by one, so that a thread leaves others their turns.
         before: Chunks in front of the pixels.
     """

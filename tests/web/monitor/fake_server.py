@@ -20,7 +20,6 @@ import struct
 import sys
 import tempfile
 import time
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -46,6 +45,7 @@ from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
+from rmpa.web.pictures import png_file
 from rmpa.web.server.app import HEADERS
 from tests.web.monitor import wrapped
 from tests.web.monitor.recorded import Recordings
@@ -592,13 +592,8 @@ def _room(angle: float) -> float:
 
 
 def _png(width: int, height: int, at: float) -> bytes:
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     shift = int(at * 20)
-    rows = b"".join(b"\0" + bytes((x + y + shift) & 255 for x in range(width)) for y in range(height))
-    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
+    return png_file(width, height, 0, (bytes((x + y + shift) & 255 for x in range(width)) for y in range(height)))
 
 
 if __name__ == "__main__":
