@@ -82,7 +82,7 @@ def judged(policy: AccessPolicy, place: Any = "", **facts: Any) -> str:
 
 LISTED = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
 ORIGIN = "http://base.local:8480"
-APP = {"origin": "https://app.example", "preflight": "GET"}
+APP: dict[str, Any] = {"origin": "https://app.example", "preflight": "GET"}
 # Each: what the request has beside ``Host: base.local:8480``, and what becomes of it.
 WITHOUT_TOKEN: list[Any] = [
     # A name that is not ours is a rebound one; an address cannot be rebound.

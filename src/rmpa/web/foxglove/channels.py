@@ -89,7 +89,7 @@ class Offers(Generic[_Offer]):
     """
 
     def __init__(self, make: type[_Offer]) -> None:
-        self._make = make
+        self._make: type[_Offer] = make
         self._numbers = itertools.count(1)
         # By the name of the topic or service, its type, and the md5 sum of that; "" for the one that is known best.
         self.by_key: dict[_Key, _Offer] = {}
@@ -100,8 +100,9 @@ class Offers(Generic[_Offer]):
         gone = [self.by_key.pop(key).id for key in [*self.by_key] if key not in wanted]
         for each in gone:
             del self.by_id[each]
-        news = [message(f"un{self._make.op}", **{f"{self._make.items[:-1]}Ids": gone})] if gone else []
-        made = []
+        ids = {f"{self._make.items[:-1]}Ids": gone}
+        news: list[OutFrame] = [message(f"un{self._make.op}", **ids)] if gone else []
+        made: list[_Offer] = []
         for key, kind in wanted.items():
             if kind is not None and key not in self.by_key:
                 offer = self._make(next(self._numbers), key, kind)

@@ -358,7 +358,8 @@ class HubTopics:
 
     def close(self) -> None:
         """End all."""
-        for there in [*self.subscribed.values(), *self.published.values()]:
+        open_: list[_Topic | _Publisher] = [*self.subscribed.values(), *self.published.values()]
+        for there in open_:
             there.end()
 
     def keep(self, latched: _Latched) -> _Latched:
