@@ -1,8 +1,8 @@
 """What another package adds to RMPA: the command ``rmpa hello``, and the WebSocket protocol ``hello.v1``."""
 
 from rmpa.cli.options import Options, agent_verb, argument
-from rmpa.web.clients.connection import Session
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.connection import Session
+from rmpa.web.hub.frame_writer import Opcode
 
 
 @agent_verb(argument("name", default="world"))

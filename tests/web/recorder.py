@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,14 +13,15 @@ import cbor2
 import msgspec
 
 from rmpa.core.errors import RmpaError
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType
-from rmpa.web.clients.connection import ClientStream
-from rmpa.web.clients.frame_writer import FairQueue, Opcode, OutFrame
+from rmpa.web.hub.connection import ClientStream
+from rmpa.web.hub.frame_writer import FairQueue, Opcode, OutFrame
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import EVERYTHING
-from rmpa.web.hub.topics import ReceivedMessage
+from rmpa.web.hub.topics import MadeOnce, ReceivedMessage
 from rmpa.web.hub.transforms import TransformTree
 
 NOW_NS = 1_700_000_000_000_000_123
@@ -111,6 +113,9 @@ class Types:
     def version(self, name: str, md5sum: str) -> MessageType:
         return self.versions.get(md5sum) or self.message(name)
 
+    def codec(self, message: ReceivedMessage) -> MessageCodec:
+        return codec_for(self.version(message.type, message.md5sum))
+
     def service(self, name: str) -> ServiceType:
         return ServiceType(name)
 
@@ -148,10 +153,11 @@ class FakeHub:
         self.types = Types()
         self.published: dict[str, str] = {}
         self.params = Params()
+        self.frames: MadeOnce[OutFrame] = MadeOnce(1 << 20)
         self.link = SimpleNamespace(rules=EVERYTHING)
         # Of parts that all clients share: what each topic's message is given to, while it is subscribed to.
         self.shared: dict[str, Callable[[ReceivedMessage], None]] = {}
-        self.topics = SimpleNamespace(publishers=SimpleNamespace(names=self.published), subscribe=self._subscribe)
+        self.topics = SimpleNamespace(published=self.published, subscribe=self._subscribe)
         topics: Any = self.topics
         types: Any = self.types
         self.transforms = TransformTree(topics, types)
@@ -178,12 +184,12 @@ class Connection:
         self.queue.pace(stream, interval, length)
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
-        self.queue.push(stream, lambda now: stream.frames(message, now), 1, 0, self._client.now)
+        self.queue.push(stream, functools.partial(stream.frames, message), 1, 0, self._client.now)
         self.flush()
 
     def flush(self) -> None:
         while (entry := self.queue.pop(self._client.now)) is not None:
-            self.sent += entry(self._client.now)
+            self.sent += entry()
 
     def end(self, code: int, _reason: str, _refusal: str = "") -> None:
         self.ended.append(code)

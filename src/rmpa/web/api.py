@@ -1,7 +1,6 @@
 """What programs read of the agent: parts of its snapshot as JSON (REST), and its figures for Prometheus; no I/O.
 
-The types of the REST API are those of ``observe.snapshot``, as ``--json`` of the commands gives them. Errors are
-problem details (RFC 9457).
+The types of the REST API are those of ``observe.snapshot``, as ``--json`` of the commands gives them.
 
 Names, units and types of the metrics are as in prometheus.io/docs/practices/naming: base units, ``_total`` for
 counters, times as seconds since the epoch, quantiles as summaries. Labels name peers, topics, nodes and services,
@@ -19,7 +18,8 @@ import msgspec
 from rmpa.config.values import did_you_mean
 from rmpa.core.identity import is_legal_name
 from rmpa.web import limits
-from rmpa.web.clients.clients import CLIENT_REFUSALS, PROTOCOLS, ClientFigures
+from rmpa.web.clients import CLIENT_REFUSALS, PROTOCOLS, ClientFigures
+from rmpa.web.server.access import Problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -46,62 +46,35 @@ _PATHS: Final = (
 )
 # Names that a wrong one is compared with for a hint, which takes some microseconds each.
 _NAMES_COMPARED: Final = 1000
-_TITLES: Final = {
-    400: "Bad request",
-    401: "A token is needed",
-    403: "Refused",
-    404: "Not found",
-    405: "Method not allowed",
-    413: "Too large",
-    415: "Not an image",
-    429: "Too many at one time",
-    500: "Internal error",
-    502: "Not made",
-    503: "The agent does not answer",
-    504: "No picture",
-}
 
 
-class RestResponse(NamedTuple):
-    """An HTTP response: status, body, its type, further headers, and of a problem its ``detail``."""
-
-    status: int
-    body: bytes
-    content_type: str = "application/json"
-    headers: tuple[tuple[str, str], ...] = ()
-    detail: str = ""
-
-
-def problem(status: int, detail: str, headers: tuple[tuple[str, str], ...] = ()) -> RestResponse:
-    """Why a request has no result (RFC 9457): ``detail`` says what happened, and what to do."""
-    body = msgspec.json.encode({"title": _TITLES[status], "status": status, "detail": detail})
-    return RestResponse(status, body, "application/problem+json", headers, detail)
-
-
-def respond(path: str, snapshot: Snapshot | None, why: str = "") -> RestResponse:
-    """The response to a request by GET or HEAD.
+def respond(path: str, snapshot: Snapshot | None, why: str = "") -> bytes:
+    """The JSON that answers a request by GET or HEAD.
 
     Args:
         path: Percent-encoded, without the query. Slashes of a topic's or a service's name need no encoding.
         snapshot: The newest; ``None`` while the agent does not answer.
         why: Why it does not, and what to do, where that is known.
+
+    Raises:
+        Problem: There is no such thing, or no snapshot.
     """
     below = path.removeprefix(PREFIX)
     kind, slash, rest = below.removeprefix("/").partition("/")
     known = (f"/{kind}/{{name}}" if rest else below) in _PATHS
     if below == path or len(path) > limits.REST_PATH_MAX or not known or bool(slash) != bool(rest):
-        return problem(404, f"there is no {_short(path)}; below {PREFIX} there are {', '.join(_PATHS)}")
+        raise Problem(404, f"there is no {_short(path)}; below {PREFIX} there are {', '.join(_PATHS)}")
     if snapshot is None:
-        return problem(503, why or "the agent does not answer; start it with rmpa up, or look at its log")
+        raise Problem(503, why or "the agent does not answer; start it with rmpa up, or look at its log")
     found: Any = snapshot if kind == "snapshot" else getattr(snapshot, kind)
     if rest:
         name = unquote(rest, errors="replace")
         wanted = name if kind == "peers" or name.startswith("/") else f"/{name}"
         named = tuple(each for each in found if each.name == wanted)
         if not named:
-            return problem(404, _missing(kind, wanted, [each.name for each in found[:_NAMES_COMPARED]]))
+            raise Problem(404, _missing(kind, wanted, [each.name for each in found[:_NAMES_COMPARED]]))
         found = named if kind == "services" else named[0]
-    return RestResponse(200, msgspec.json.encode(found))
+    return msgspec.json.encode(found)
 
 
 def _missing(kind: str, name: str, names: Sequence[str]) -> str:

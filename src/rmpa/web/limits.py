@@ -20,6 +20,12 @@ SUBSCRIPTION_QUEUE_BYTES: Final = 8 * MIB
 PAYLOAD_BUFFER_MIN: Final = 64 * KIB
 # Such buffers, used and unused; each is looked at until one is unused.
 PAYLOAD_BUFFERS_MAX: Final = 64
+# Messages of which it is kept what was made of them, for further clients of the same topic.
+MADE_KEPT: Final = 64
+# Bytes of the frames of rosbridge and their messages that are kept so; larger messages are converted for each client.
+FRAMES_KEPT_BYTES: Final = 16 * MIB
+# Bytes of the messages whose values are kept so; values take some ten times as much.
+VALUES_KEPT_BYTES: Final = 4 * MIB
 # [Web] WebSocket clients, pages of the monitor included
 # At it: further ones get 503
 # Told in: the response, `rmpa_web_refused_total`, log

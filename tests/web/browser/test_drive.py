@@ -172,7 +172,7 @@ async def test_the_page_shows_who_drives_what_and_each_page_may_stop_it(site: Si
     page = await site.open("drive")
     await page.wait_text("The stick is free")
     await page.wait("document.querySelector('.chain').innerText.includes('/safety_stop')")
-    stick = site.server.sticks.show("/cmd_vel", "other", lambda: None, drives=True)
+    stick = site.server.sticks.show("/cmd_vel", "other", lambda _: None, drives=True)
     stick.take("other", "10.0.0.99")
     await page.wait_text("The page of 10.0.0.99")
     await page.press("Escape")
@@ -203,7 +203,7 @@ async def test_who_may_not_drive_sees_who_does_and_may_stop_it(site: Site) -> No
     page = await site.open("drive")
     await page.wait_text("This page may not drive")
     assert await page.run(f"{TICK}.disabled") is True
-    stick = site.server.sticks.show("/cmd_vel", "other", lambda: None, drives=True)
+    stick = site.server.sticks.show("/cmd_vel", "other", lambda _: None, drives=True)
     stick.take("other", "10.0.0.99")
     await page.wait_text("The page of 10.0.0.99")
     await page.click("Stop the robot")

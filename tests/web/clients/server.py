@@ -6,15 +6,16 @@ import asyncio
 import contextlib
 import json
 import ssl
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 from aiohttp import web
 
+from rmpa.core.contract import Contracts
 from rmpa.ros.core.embedded import RosCore
-from rmpa.web.clients.clients import MONITOR_PATH, WebSocketClients
+from rmpa.web.clients import MONITOR_PATH, WebSocketClients
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.monitor.monitor import Monitor
 from rmpa.web.server.agent_watch import AgentWatch
@@ -71,8 +72,8 @@ class Server:
 async def running_server(
     core: RosCore,
     rights: Rights = FULL,
-    priority: Callable[[str], int] = lambda _: 0,
     *,
+    contracts: Contracts | None = None,
     port: int = 0,
     watch: AgentWatch | None = None,
     tls: tuple[ssl.SSLContext, ssl.SSLContext] | None = None,
@@ -84,11 +85,11 @@ async def running_server(
         static: The folder of the pages, which are at ``/pages``.
         tls: The contexts of the server and of its clients.
     """
-    async with running_hub(core) as hub:
+    async with running_hub(core, contracts=contracts) as hub:
         monitor = Monitor(hub, watch, {}) if watch is not None else None
         if monitor is not None:
             monitor.start()
-        sockets = WebSocketClients(hub, "test", rights, priority, monitor)
+        sockets = WebSocketClients(hub, "test", rights, monitor)
         app = web.Application()
         for path in ("/", MONITOR_PATH):
             app.router.add_get(path, sockets.handle)

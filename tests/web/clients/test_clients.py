@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
@@ -154,7 +155,7 @@ async def test_the_hub_has_nothing_left_of_a_client_that_went(
                 await until(lambda: not server.hub.clients)
             await until(lambda: publisher.subscribers == 0 and not core.publishers("/u"))
         assert not server.sockets.connections
-        assert not server.hub.topics.names
+        assert not server.hub.topics.subscribed
 
 
 @contextlib.asynccontextmanager
@@ -223,13 +224,8 @@ async def test_what_tcp_kept_over_a_cut_is_dropped_where_commands_may_not_be_old
 
 async def test_a_command_overtakes_the_images_that_wait(core: RosCore, talker: Node) -> None:
     payload = payload_of(500_000)
-    priorities: list[str] = []
-
-    def priority(topic: str) -> int:
-        priorities.append(topic)
-        return int(topic == "/cmd")
-
-    async with running_server(core, priority=priority) as server, server.client(FOXGLOVE) as client:
+    contracts = Contracts((ContractRule(("/cmd",), (), {"priority": Priority.HIGH}),))
+    async with running_server(core, contracts=contracts) as server, server.client(FOXGLOVE) as client:
         image, command = [await talker.advertise(*each) for each in (("/image", BYTES), ("/cmd", STRING))]
         await subscribe(client, "/image", "/cmd")
         await image.wait_for_subscriber()
@@ -246,4 +242,3 @@ async def test_a_command_overtakes_the_images_that_wait(core: RosCore, talker: N
         client.socket._reader._protocol.resume_reading()
         order = [struct.unpack_from("<BI", await client.next_bytes())[1] for _ in range(images + 1)]
         assert order.index(1) <= images - 4
-        assert set(priorities) == {"/image", "/cmd"}

@@ -6,9 +6,9 @@ from typing import Any
 
 import msgspec
 
-from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.session import FoxgloveSession
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.graph import GraphService, GraphTopic
 from rmpa.web.hub.node_link import Rights
 from tests.web.recorder import Asked, FakeHub, Recorded, record
@@ -24,10 +24,11 @@ class Client(Recorded):
     def __init__(self, rights: Rights = ALL, *, sim_time: bool = False, beside: Client | None = None) -> None:
         hub: Any = FakeHub(sim_time=sim_time) if beside is None else beside.hub
         self.hub: FakeHub = hub
-        self.table: ChannelTable = beside.table if beside else ChannelTable(hub, services=rights.control)
+        self.table: ChannelTable = beside.table if beside else ChannelTable(hub, "base", services=rights.control)
         if beside is None:
             record(self.table._client, [])
-        session = FoxgloveSession(hub, rights, lambda _: 0, "here", self.table, ("base", "run-1"))
+        self.table.run = "run-1"
+        session = FoxgloveSession(hub, rights, "here", self.table)
         super().__init__(session)
         session.opened()
 

@@ -15,23 +15,23 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.web.clients.frame_writer import Opcode, OutFrame
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.channels import Channel, FoxgloveService, graph_update
 from rmpa.web.foxglove.protocol import FoxgloveParameter as Parameter
 from rmpa.web.foxglove.protocol import from_parameter, to_parameter
 from rmpa.web.foxglove.session import DECODER, OPS
+from rmpa.web.hub.frame_writer import Opcode, OutFrame
 from rmpa.web.hub.node_link import ParamValue
 from tests.web.foxglove.client import Client
 from tests.web.recorder import Asked
 
-CHATTER = Channel(1, "/chatter", "std_msgs/String", "", "string data")
+CHATTER = Channel(1, ("/chatter", "std_msgs/String", ""), SimpleNamespace(md5sum="", definition="string data"))
 KIND: Any = SimpleNamespace(
     name="std_srvs/SetBool",
     request=SimpleNamespace(definition="bool data"),
     response=SimpleNamespace(definition="bool success\nstring message"),
 )
-SET_BOOL = FoxgloveService(1, "/set_bool", KIND)
+SET_BOOL = FoxgloveService(1, ("/set_bool", KIND.name, ""), KIND)
 GOLDEN = Path(__file__).with_name("golden.jsonl").read_bytes().splitlines()
 VALUES: dict[str, ParamValue] = {"/a": 1, "/c": b"ABCD", "/d": [1.5, 2.0], "/e": {"x": True}}
 JSON = dict(

@@ -7,6 +7,7 @@ import itertools
 from collections.abc import AsyncIterator, Coroutine
 from typing import Any
 
+from rmpa.core.contract import Contracts
 from rmpa.core.errors import RmpaError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
@@ -43,7 +44,11 @@ async def listen(node: Node, topic: str) -> list[bytes]:
 
 @contextlib.asynccontextmanager
 async def running_hub(
-    core: RosCore, rules: NodeRules = EVERYTHING, *, until_known: bool = True
+    core: RosCore,
+    rules: NodeRules = EVERYTHING,
+    *,
+    contracts: Contracts | None = None,
+    until_known: bool = True,
 ) -> AsyncIterator[Hub]:
     """A hub; it has its node, and has read the graph and the parameters, unless ``until_known`` is false."""
 
@@ -54,6 +59,7 @@ async def running_hub(
         where,
         lambda uri, updated: Node("rmpa_web", master_uri=uri, environment=RosEnvironment(), on_param_update=updated),
         rules=rules,
+        contracts=contracts,
     ) as hub:
         hub.start()
         if until_known:
@@ -63,7 +69,7 @@ async def running_hub(
 
 async def subscribed(hub: Hub, count: int) -> None:
     """Wait until the hub's clients have so many subscriptions."""
-    await until(lambda: sum(len(each.subscriptions) for each in hub.topics._topics.values()) >= count)
+    await until(lambda: sum(len(each.users) for each in hub.topics.subscribed.values()) >= count)
 
 
 class Heard:

@@ -20,7 +20,6 @@ import struct
 import sys
 import tempfile
 import time
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -37,16 +36,16 @@ from rmpa.observe.peers import judge_stranger
 from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor.diagnostics import DiagnosticsFeed
-from rmpa.web.monitor.driving import TYPES
+from rmpa.web.monitor.driving import TYPES, Sticks
 from rmpa.web.monitor.messages import SUBPROTOCOL, Tree
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.session import MonitorSession
 from rmpa.web.monitor.state import StateBuilder, details, node_detail, node_key
-from rmpa.web.monitor.sticks import Sticks
+from rmpa.web.pictures import png_file
 from rmpa.web.server.app import HEADERS
 from tests.web.monitor import wrapped
 from tests.web.monitor.recorded import Recordings
@@ -116,7 +115,7 @@ class Reports:
         self.take = take
         return SimpleNamespace(close=lambda: None)
 
-    def of(self, message: Any) -> Any:
+    def values(self, message: Any) -> Any:
         return message.values
 
     def report(self) -> None:
@@ -282,7 +281,7 @@ class FakeServer:
         self._mute_since = 0.0
         self.reports_of_nodes = Reports()
         reports: Any = self.reports_of_nodes
-        self._diagnostics = DiagnosticsFeed(reports, reports, lambda: None)
+        self._diagnostics = DiagnosticsFeed(reports, lambda: None)
         self._reported = 0.0
         self.recordings = Recordings()
         # Where the files of resources are, while it is served.
@@ -328,7 +327,7 @@ class FakeServer:
         if self.params != self._params_told:
             self._params_told = dict(self.params)
             self._param_changes += 1
-        self._diagnostics.follow(wanted=True)
+        self._diagnostics.follow()
         if self.agent.scene == "ill" and time.time() - self._reported > 0.5:
             self._reported = time.time()
             self.reports_of_nodes.report()
@@ -528,12 +527,18 @@ class _Client(Recorded):
     def __init__(self, server: FakeServer, socket: web.WebSocketResponse) -> None:
         self._server = server
         self._socket = socket
-        mesh = SimpleNamespace(agent="pc", details=server._details, follow=lambda *_: None, unfollow=lambda _: None)
-        answers, values = SimpleNamespace(answer=server.answer), SimpleNamespace(of=self._decode)
-        monitor: Any = SimpleNamespace(mesh=mesh, answers=answers, values=values, sticks=server.sticks)
+        monitor: Any = SimpleNamespace(
+            module="pc",
+            details=server._details,
+            follow=lambda *_: None,
+            unfollow=lambda _: None,
+            answers=server,
+            sticks=server.sticks,
+        )
         hub: Any = FakeHub()
+        hub.values = self._decode
         address = f"10.0.0.{next(server.pages)}"
-        super().__init__(MonitorSession(hub, server.rights, lambda _: 0, address, monitor, time.monotonic))
+        super().__init__(MonitorSession(hub, server.rights, address, monitor, time.monotonic))
         self.page = self.connection = self.session.connection = PageConnection(self)
 
     def _decode(self, message: ReceivedMessage) -> Any:
@@ -587,13 +592,8 @@ def _room(angle: float) -> float:
 
 
 def _png(width: int, height: int, at: float) -> bytes:
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     shift = int(at * 20)
-    rows = b"".join(b"\0" + bytes((x + y + shift) & 255 for x in range(width)) for y in range(height))
-    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
+    return png_file(width, height, 0, (bytes((x + y + shift) & 255 for x in range(width)) for y in range(height)))
 
 
 if __name__ == "__main__":

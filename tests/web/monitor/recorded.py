@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from aiohttp import web
 
-from rmpa.web.api import RestResponse
 from rmpa.web.hub.node_link import EVERYTHING
+from rmpa.web.server.access import Problem
 from rmpa.web.server.recordings import ROUTE, RecordingFiles
 
 FELL: Final = "20261129-121500-pc-it_fell"
@@ -82,8 +82,10 @@ class Recordings:
             await self._files.close()
 
     async def _respond(self, request: web.Request) -> web.StreamResponse:
-        made = await self._files.respond(request, None, lambda _: None)
-        return web.Response(status=made.status, body=made.body) if isinstance(made, RestResponse) else made
+        try:
+            return await self._files.respond(request)
+        except Problem as problem:
+            return web.Response(status=problem.status, body=problem.body)
 
     def answer(self, what: str, args: dict[str, Any]) -> Any:
         """The answer to a question of a page."""

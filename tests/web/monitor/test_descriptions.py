@@ -243,7 +243,9 @@ def agent(monkeypatch: pytest.MonkeyPatch) -> Agent:
 def answers_of(rules: NodeRules = EVERYTHING, folder: str = "") -> Answers:
     hub: Any = FakeHub()
     hub.link = SimpleNamespace(rules=rules)
-    return Answers(hub, hub, {}, lambda: "", descriptions=Descriptions(folder, check))
+    answers = Answers(hub, SimpleNamespace(agent=""), {})  # type: ignore[arg-type]
+    answers.descriptions = Descriptions(folder, check)
+    return answers
 
 
 async def test_a_resource_of_any_module_is_started_by_its_agent_and_under_control_alone(agent: Agent) -> None:

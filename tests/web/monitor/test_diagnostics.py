@@ -44,8 +44,8 @@ class Hub(Reports):
 async def shown(hub: Hub) -> tuple[DiagnosticsFeed, asyncio.Event]:
     """A feed that pages follow, and what is set when they are to be shown something."""
     news = asyncio.Event()
-    feed = DiagnosticsFeed(hub, hub, news.set)  # type: ignore[arg-type]
-    feed.follow(wanted=True)
+    feed = DiagnosticsFeed(hub, news.set)  # type: ignore[arg-type]
+    feed.follow()
     return feed, news
 
 
@@ -55,7 +55,7 @@ async def test_it_listens_while_a_page_is_open_and_there_is_something_to_hear() 
     assert alone.open == 0  # the agent says it to pages in other ways
     feed.all()
     await until(lambda: alone.open == 1)
-    feed.follow(wanted=False)
+    feed.close()
     assert alone.open == 0
     hub = Hub("/rmpa", "/rmpa/base/arm")
     feed, _ = await shown(hub)

@@ -43,7 +43,7 @@ def driver(type_: str) -> tuple[Driver, Wheels]:
 
 def test_a_jump_of_the_stick_is_a_ramp_and_a_stop_is_immediate() -> None:
     made, wheels = driver("geometry_msgs/Twist")
-    made.arm(10.0)
+    made.command(Command(), 1.0, 10.0)
     for number in range(1, 31):
         made.command(Command(1.0, angular=-1.0), 1.0, 10.0 + number / 10)
     made.command(Command(0.5), 1.0, 13.1)
@@ -58,7 +58,7 @@ def test_a_jump_of_the_stick_is_a_ramp_and_a_stop_is_immediate() -> None:
 
 def test_a_pause_between_commands_is_no_leap() -> None:
     made, wheels = driver("geometry_msgs/Twist")
-    made.arm(10.0)
+    made.command(Command(), 1.0, 10.0)
     made.command(Command(1.0), 1.0, 20.0)
     assert wheels.messages()[-1]["linear"]["x"] == pytest.approx(limits.DRIVE_TIMEOUT)
 
@@ -75,7 +75,7 @@ def test_a_pause_between_commands_is_no_leap() -> None:
 )
 def test_each_type_has_its_message_and_its_stop(type_: str, values: Any) -> None:
     made, wheels = driver(type_)
-    made.arm(0.0)
+    made.command(FULL, 1.0, 0.0)
     for number in range(20):
         made.command(FULL, limits.DRIVE_ACCELERATION, number / 5)
     made.stop()

@@ -16,15 +16,15 @@ from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import (
     IMAGE_HEADER,
     SampleBuffer,
-    compressed_picture,
     cut,
     difference,
     field_path,
+    image_frame,
     number_at,
-    raw_picture,
     scan,
     without_nulls,
 )
+from rmpa.web.pictures import compressed_picture, raw_picture
 from tests.web.monitor.patches import apply
 
 
@@ -117,7 +117,7 @@ def test_an_image_that_cannot_be_is_refused(width: int, height: int, encoding: s
 
 def test_a_compressed_image_is_passed_on_as_it_is() -> None:
     jpeg = b"\xff\xd8\xff\xe0 and so on"
-    frame = compressed_picture("rgb8; jpeg compressed bgr8", jpeg).frame(7, 123)
+    frame = image_frame(compressed_picture("rgb8; jpeg compressed bgr8", jpeg), 7, 123)
     assert IMAGE_HEADER.unpack_from(frame) == (1, 1, 0, 0, 0, 7, 123, 0, 0)
     assert frame[IMAGE_HEADER.size :] == jpeg
     with pytest.raises(RemoteProtocolError, match="neither JPEG nor PNG"):

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.hub.node_link import FULL, Rights
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import driving, limits
+from rmpa.web.monitor.driving import Sticks
 from rmpa.web.monitor.session import MonitorSession
-from rmpa.web.monitor.sticks import Sticks
 from tests.web.monitor.patches import apply
 from tests.web.monitor.test_sticks import Bus
 from tests.web.recorder import Asked, FakeHub, PageConnection, Recorded
@@ -40,14 +40,16 @@ class Page(Recorded):
         self.kept: list[Any] = []
         made: Any = Bus()
         monitor: Any = SimpleNamespace(
-            mesh=SimpleNamespace(agent="pc", details=self._details, follow=lambda *_: None, unfollow=lambda _: None),
-            values=SimpleNamespace(of=self._decode),
-            log=SimpleNamespace(follow=lambda *_: self.kept, unfollow=lambda _: None, refused=None),
+            module="pc",
+            details=self._details,
+            follow=lambda *_: None,
+            unfollow=lambda _: None,
             answers=SimpleNamespace(answer=self._asked),
             sticks=sticks or Sticks(made, lambda: "pc", lambda: self.now),
         )
         hub: Any = FakeHub()
-        super().__init__(MonitorSession(hub, rights, lambda _: 0, "page", monitor, lambda: self.now))
+        hub.values = self._decode
+        super().__init__(MonitorSession(hub, rights, "page", monitor, lambda: self.now))
         self.now = 100.0
         self.page = self.connection = self.session.connection = PageConnection(self)
         self.session.opened()

@@ -19,7 +19,7 @@ from rmpa.observe.snapshot import PeerInfo, Snapshot
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web.monitor import limits, messages, questions, session
 from rmpa.web.monitor.messages import Tree, difference
-from rmpa.web.monitor.rates import RatesFeed
+from rmpa.web.monitor.monitor import RatesFeed
 from rmpa.web.monitor.resources import ResourceFacts
 from rmpa.web.monitor.state import StateBuilder, details, module_state
 from tests.web.monitor.fake_server import resources, snapshots

@@ -13,7 +13,7 @@ import pytest
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.monitor import limits
-from rmpa.web.monitor.sticks import Stick, Sticks
+from rmpa.web.monitor.driving import Stick, Sticks
 
 TOPIC = "/cmd_vel"
 
@@ -26,7 +26,6 @@ class Bus:
         self.held: list[Callable[[], None]] | None = None
         self.refuses: RmpaError | None = None
         self.topics: Any = self
-        self.publishers: Any = self
 
     def subscribe(self, topic: str, _type: str, receive: Callable[[ReceivedMessage], None], _failed: Any) -> Any:
         entry = topic, receive
@@ -61,7 +60,7 @@ class Mesh:
         self.sticks = {name: self.show(name, name) for name in modules}
 
     def show(self, module: str, page: str) -> Stick:
-        return self.servers[module].show(TOPIC, page, lambda: None, drives=True)
+        return self.servers[module].show(TOPIC, page, lambda _: None, drives=True)
 
     def after(self, seconds: float) -> None:
         end = self.now + seconds
@@ -125,7 +124,7 @@ def test_a_newcomer_with_a_low_number_is_heard_where_it_is_free() -> None:
     for _ in range(5):
         mesh.sticks["base"].take("base", "10.0.0.1")
         mesh.sticks["base"].leave("base")
-    mesh.servers["pc"].hide(mesh.sticks["pc"], "pc")
+    mesh.sticks["pc"].hide("pc")
     mesh.sticks["pc"] = mesh.show("pc", "pc")
     mesh.sticks["pc"].take("pc", "10.0.0.2")
     mesh.after(2 * limits.STICK_EXPIRY)
@@ -167,12 +166,12 @@ def test_a_mesh_whose_rules_forbid_it_has_it_within_one_server_and_says_so() -> 
     mesh.bus.refuses = RmpaError("no [[permission]] lets web publish /cmd_vel/holder")
     hub: Any = mesh.bus
     sticks = Sticks(hub, lambda: "pc", lambda: 0.0)
-    stick = sticks.show(TOPIC, "one", lambda: None, drives=True)
+    stick = sticks.show(TOPIC, "one", lambda _: None, drives=True)
     stick.take("one", "10.0.0.1")
     assert "no [[permission]] lets web publish" in stick.problem
     with pytest.raises(PeerRefused):
         stick.take("two", "10.0.0.2")
-    sticks.hide(stick, "one")
+    stick.hide("one")
     assert not mesh.bus.receivers, "nothing is left open"
 
 

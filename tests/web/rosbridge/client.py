@@ -8,7 +8,6 @@ import msgspec
 
 from rmpa.ros.types.messages import MessageType
 from rmpa.web.hub.node_link import FULL
-from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 from tests.web.recorder import Asked, FakeHub, Recorded, decoded
 
@@ -16,11 +15,11 @@ from tests.web.recorder import Asked, FakeHub, Recorded, decoded
 class Client(Recorded):
     """One client with its session."""
 
-    def __init__(self, encoder: PublishFrames | None = None) -> None:
+    def __init__(self) -> None:
         self.hub = FakeHub()
         self.graph = self.hub.graph
         hub: Any = self.hub
-        super().__init__(RosbridgeSession(hub, FULL, lambda _: 0, "here", encoder or PublishFrames()))
+        super().__init__(RosbridgeSession(hub, FULL, "here"))
 
     def send(self, op: str, **values: Any) -> list[Asked]:
         return self.send_raw(msgspec.json.encode({"op": op, **values}).decode())

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rmpa.core.errors import PeerRefused
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import decode_png
 from rmpa.web.rosbridge.session import OPS

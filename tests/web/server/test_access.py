@@ -10,10 +10,12 @@ import struct
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final, Self
 
 import aiohttp
 import pytest
+from multidict import CIMultiDict
 
 from rmpa.config.peer_rules import Effect, PermissionRule
 from rmpa.config.settings import TrustSettings, WebSettings
@@ -29,9 +31,7 @@ from rmpa.web.rosbridge import session as rosbridge
 from rmpa.web.rosbridge.rosapi import SERVICES
 from rmpa.web.server.access import (
     AccessPolicy,
-    AccessRefused,
-    RequestFacts,
-    Verdict,
+    Problem,
     is_loopback,
     own_names,
     token_from,
@@ -48,13 +48,41 @@ CLOSED = AccessPolicy(8480, HOSTS, TOKEN)
 HERE = ("base.local:8480",)
 
 
-def reason(verdict: Verdict) -> str:
-    return verdict.reason if isinstance(verdict, AccessRefused) else verdict
+# The headers that the table names otherwise.
+NAMES = {"fetch_site": "Sec-Fetch-Site", "fetch_mode": "Sec-Fetch-Mode", "preflight": "Access-Control-Request-Method"}
+
+
+def asked(
+    host: tuple[str, ...] = HERE,
+    *,
+    token: str | None = None,
+    cookie: str | None = None,
+    secure: bool = False,
+    **more: Any,
+) -> Any:
+    """A request with these headers; ``None`` is one that is missing."""
+    headers = CIMultiDict(("Host", each) for each in host)
+    headers.extend({NAMES.get(name, name): value for name, value in more.items() if value is not None})
+    return SimpleNamespace(
+        method="OPTIONS" if "preflight" in more else "GET",
+        headers=headers,
+        query={} if token is None else {"token": token},
+        cookies={} if cookie is None else {CLOSED.cookie: cookie},
+        secure=secure,
+    )
+
+
+def judged(policy: AccessPolicy, place: Any = "", **facts: Any) -> str:
+    """The verdict, or why there is none."""
+    try:
+        return policy.judge(asked(**facts), place)
+    except Problem as problem:
+        return problem.reason
 
 
 LISTED = AccessPolicy(8480, HOSTS, TOKEN, frozenset({"https://app.example", "*"}))
 ORIGIN = "http://base.local:8480"
-APP = {"origin": "https://app.example", "is_preflight": True}
+APP: dict[str, Any] = {"origin": "https://app.example", "preflight": "GET"}
 # Each: what the request has beside ``Host: base.local:8480``, and what becomes of it.
 WITHOUT_TOKEN: list[Any] = [
     # A name that is not ours is a rebound one; an address cannot be rebound.
@@ -73,10 +101,10 @@ WITHOUT_TOKEN: list[Any] = [
     *(({"origin": each, "secure": True}, "origin") for each in (ORIGIN, "HTTP://base.local:8480", "null")),
     # What other sites load is refused without an origin, too; a link on another page may lead here.
     ({"fetch_site": "same-origin", "fetch_mode": "cors"}, "granted"),
-    ({"fetch_site": "none", "fetch_mode": "navigate", "is_page": True}, "granted"),
-    ({"fetch_site": "cross-site", "fetch_mode": "navigate", "is_page": True}, "granted"),
+    ({"fetch_site": "none", "fetch_mode": "navigate", "place": "page"}, "granted"),
+    ({"fetch_site": "cross-site", "fetch_mode": "navigate", "place": "page"}, "granted"),
     *(({"fetch_site": "cross-site", "fetch_mode": each}, "origin") for each in ("navigate", "no-cors", "websocket")),
-    ({"fetch_site": "same-site", "fetch_mode": "no-cors", "is_page": True}, "origin"),  # another port of this host
+    ({"fetch_site": "same-site", "fetch_mode": "no-cors", "place": "page"}, "origin"),  # another port of this host
 ]
 WITH_TOKEN: list[Any] = [
     # It comes as bearer, cookie or query.
@@ -86,15 +114,15 @@ WITH_TOKEN: list[Any] = [
     ({"authorization": f"Basic {TOKEN}"}, "token"),
     ({"cookie": TOKEN}, "granted"),
     ({"token": TOKEN}, "granted"),
-    ({"token": TOKEN, "is_page": True}, "move token"),
-    ({"token": TOKEN, "is_page": True, "cookie": "old"}, "move token"),
-    ({"token": "wrong", "is_page": True}, "token"),
+    ({"token": TOKEN, "place": "page"}, "move token"),
+    ({"token": TOKEN, "place": "page", "cookie": "old"}, "move token"),
+    ({"token": "wrong", "place": "page"}, "token"),
     ({"token": "wrong", "cookie": TOKEN}, "granted"),
-    ({"is_open": True}, "granted"),
+    ({"place": "open"}, "granted"),
     # Only listed sites are told what their pages may send.
     (APP, "preflight"),
     (APP | {"origin": "https://APP.example"}, "preflight"),
-    (APP | {"is_preflight": False}, "token"),
+    ({"origin": "https://app.example"}, "token"),
     *((APP | {"origin": each}, "origin") for each in ("http://app.example", "https://app.example:8443", "*", "null")),
     (APP | {"origin": "https://app.example.evil.example"}, "origin"),
     *((APP | {"origin": each}, "token") for each in (ORIGIN, None)),  # our own pages ask nothing before
@@ -104,27 +132,27 @@ WITH_TOKEN: list[Any] = [
 
 @pytest.mark.parametrize(("given", "expected"), WITHOUT_TOKEN)
 def test_who_may_ask_where_there_is_no_token(given: dict[str, Any], expected: str) -> None:
-    assert reason(OPEN.judge(RequestFacts(**{"host": HERE, **given}))) == expected
+    assert judged(OPEN, **given) == expected
     # The right token does not help: a rebound page would have the browser send the cookie.
     for token in ({"authorization": f"Bearer {TOKEN}"}, {"cookie": TOKEN}):
-        assert reason(CLOSED.judge(RequestFacts(**{"host": HERE, **token, **given}))) == expected
+        assert judged(CLOSED, **token | given) == expected
 
 
 @pytest.mark.parametrize(("given", "expected"), WITH_TOKEN)
 def test_who_may_ask_where_there_is_a_token(given: dict[str, Any], expected: str) -> None:
-    assert reason(LISTED.judge(RequestFacts(**{"host": HERE, **given}))) == expected
+    assert judged(LISTED, **given) == expected
 
 
 def test_a_refusal_says_what_to_do() -> None:
-    for facts, remedy in (
-        (RequestFacts(("base.lan",)), "--host"),
-        (RequestFacts(HERE, origin="http://evil.example"), "open its own pages"),
-        (RequestFacts(HERE), "Authorization: Bearer TOKEN"),
-        (RequestFacts(HERE, cookie="old"), "the token is wrong"),
+    for request, remedy in (
+        (asked(("base.lan",)), "--host"),
+        (asked(origin="http://evil.example"), "open its own pages"),
+        (asked(), "Authorization: Bearer TOKEN"),
+        (asked(cookie="old"), "the token is wrong"),
     ):
-        verdict = CLOSED.judge(facts)
-        assert isinstance(verdict, AccessRefused)
-        assert remedy in verdict.detail
+        with pytest.raises(Problem) as refused:
+            CLOSED.judge(request)
+        assert remedy in refused.value.detail
 
 
 def test_only_loopback_needs_no_token() -> None:

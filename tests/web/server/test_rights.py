@@ -30,7 +30,7 @@ from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, ParamValue, Rights
 from rmpa.web.monitor import questions
 from rmpa.web.monitor.questions import Answers
-from rmpa.web.monitor.resources import MessageValues, ResourceWatch
+from rmpa.web.monitor.resources import ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
 from tests.waiting import DEADLINE, until
 from tests.web import snapshots
@@ -256,7 +256,8 @@ async def ruled(core: RosCore, request: pytest.FixtureRequest) -> AsyncIterator[
 
 
 def answers_of(hub: Hub) -> Answers:
-    return Answers(hub, ResourceWatch(hub, MessageValues(hub)), {}, lambda: "")
+    monitor: Any = SimpleNamespace(agent="", resources=ResourceWatch(hub))
+    return Answers(hub, monitor, {})
 
 
 @pytest.mark.parametrize("ruled", [RULED], indirect=True)
@@ -283,8 +284,7 @@ async def test_a_page_of_the_monitor_gets_no_denied_parameter_and_changes_none(r
 
 @pytest.mark.parametrize("ruled", [denying(subscribe=("/arm/**",))], indirect=True)
 async def test_a_page_sees_nothing_of_topics_that_are_denied(ruled: Hub, talker: Node) -> None:
-    values = MessageValues(ruled)
-    with closing(ResourceWatch(ruled, values)) as resources:
+    with closing(ResourceWatch(ruled)) as resources:
         resources.start()
         for name in ("arm", "base"):
             publisher = await talker.advertise(f"/{name}/descriptor", TEXT, latch=True)

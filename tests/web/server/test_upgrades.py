@@ -17,13 +17,13 @@ import pytest
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.contract import ContractRule, Contracts, Priority
 from rmpa.web import limits
-from rmpa.web.clients.clients import WebSocketClients
-from rmpa.web.clients.frame_writer import Opcode, frame_header
+from rmpa.web.clients import WebSocketClients
+from rmpa.web.hub.frame_writer import Opcode, frame_header
 from rmpa.web.hub.node_link import EVERYTHING, NodeRules
 from rmpa.web.server.access import AccessPolicy, own_names
 from rmpa.web.server.agent_watch import AgentWatch
 from rmpa.web.server.app import WebServer
-from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub, priority_of
+from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup, make_hub
 from tests.waiting import DEADLINE, until
 from tests.web.hub.client import local_core
 from tests.web.snapshots import FULL as SNAPSHOT
@@ -170,9 +170,8 @@ async def test_contracts_give_priorities() -> None:
         ContractRule(("/cmd_vel",), (), {"priority": Priority.HIGH}),
         ContractRule(("/image",), (), {"priority": Priority.LOW}),
     )
-    hub = make_hub(AgentWatch(lambda: SNAPSHOT), 8480)
-    priority = priority_of(hub, Contracts(rules))
-    assert [priority(topic) for topic in ("/cmd_vel", "/odom", "/image")] == [1, 0, -1]
+    hub = make_hub(AgentWatch(lambda: SNAPSHOT), 8480, contracts=Contracts(rules))
+    assert [hub.priority(topic) for topic in ("/cmd_vel", "/odom", "/image")] == [1, 0, -1]
 
 
 def fragment(opcode: int, payload: bytes, *, last: bool = False) -> bytes:

@@ -8,9 +8,9 @@ or a service is offered once its definition is known, and has an id that is neve
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+import secrets
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar
 
 from rmpa.core.identity import is_type_name
 from rmpa.web import limits as web_limits
@@ -20,33 +20,36 @@ from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import READ_ONLY
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.clients.connection import Session
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.foxglove.session import FoxgloveSession
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower
 
 _SEPARATOR: Final = "=" * 80
 # A type's name, whether it is a service's, and the md5 sum of its version; "" for the one that is known best.
 _TypeKey: TypeAlias = tuple[str, bool, str]
+_Key: TypeAlias = tuple[str, str, str]
+_Offer = TypeVar("_Offer", "Channel", "FoxgloveService")
 _Nodes: TypeAlias = "Mapping[str, tuple[str, ...]]"
 
 
-@dataclass(slots=True, eq=False)
 class Channel:
     """A topic with one type that clients may subscribe to."""
 
-    id: int
-    topic: str
-    type: str
-    md5sum: str
-    schema: str
-    # Whether messages of its version have come.
-    delivered: bool = False
+    op, items = "advertise", "channels"
+
+    def __init__(self, number: int, key: _Key, kind: Any) -> None:
+        self.id = number
+        self.topic, self.type, _ = key
+        self.md5sum, self.schema = kind.md5sum, _schema(kind)
+        self.size = len(self.schema)
+        # Whether messages of its version have come.
+        self.delivered = False
 
     def json(self) -> dict[str, object]:
         """Its part of ``advertise``."""
@@ -54,13 +57,14 @@ class Channel:
         return {**head, "schemaEncoding": SCHEMA_ENCODING, "schema": self.schema}
 
 
-@dataclass(slots=True, eq=False)
 class FoxgloveService:
     """A service that clients may call."""
 
-    id: int
-    name: str
-    kind: ServiceType
+    op, items = "advertiseServices", "services"
+
+    def __init__(self, number: int, key: _Key, kind: Any) -> None:
+        self.id, self.name, self.kind = number, key[0], kind
+        self.size = len(kind.request.definition) + len(kind.response.definition)
 
     def json(self) -> dict[str, object]:
         """Its part of ``advertiseServices``."""
@@ -77,66 +81,107 @@ class FoxgloveService:
         return {"id": self.id, "name": self.name, "type": self.kind.name, **schemas}
 
 
+class Offers(Generic[_Offer]):
+    """What clients are offered of one kind, each with an id that is never used again.
+
+    Args:
+        make: ``(id, key, kind)``: makes an offer.
+    """
+
+    def __init__(self, make: type[_Offer]) -> None:
+        self._make: type[_Offer] = make
+        self._numbers = itertools.count(1)
+        # By the name of the topic or service, its type, and the md5 sum of that; "" for the one that is known best.
+        self.by_key: dict[_Key, _Offer] = {}
+        self.by_id: dict[int, _Offer] = {}
+
+    def update(self, wanted: Mapping[_Key, MessageType | ServiceType | None]) -> tuple[list[int], list[OutFrame]]:
+        """Withdraw what is not wanted, and offer what is and has a known type: ids that are gone, and messages."""
+        gone = [self.by_key.pop(key).id for key in [*self.by_key] if key not in wanted]
+        for each in gone:
+            del self.by_id[each]
+        ids = {f"{self._make.items[:-1]}Ids": gone}
+        news: list[OutFrame] = [message(f"un{self._make.op}", **ids)] if gone else []
+        made: list[_Offer] = []
+        for key, kind in wanted.items():
+            if kind is not None and key not in self.by_key:
+                offer = self._make(next(self._numbers), key, kind)
+                self.by_key[key] = self.by_id[offer.id] = offer
+                made.append(offer)
+        return gone, [*news, *self.parted(made)]
+
+    def parted(self, offers: Iterable[_Offer]) -> Iterator[OutFrame]:
+        """Messages that offer these, each with up to ``limits.ADVERTISE_BYTES`` of schemas, or one of them."""
+        part: list[dict[str, object]] = []
+        total = 0
+        for offer in offers:
+            if part and total + offer.size > limits.ADVERTISE_BYTES:
+                yield message(self._make.op, **{self._make.items: part})
+                part, total = [], 0
+            part.append(offer.json())
+            total += offer.size
+        if part:
+            yield message(self._make.op, **{self._make.items: part})
+
+
 class ChannelTable:
     """What all clients are offered.
 
     Args:
         hub: Has the graph and the types.
+        server: The server's name, for users.
         services: Whether clients may call services; else they are offered none.
     """
 
-    # More than 12 fields: what is offered by its key and by its id, for topics and for services.
-    def __init__(self, hub: Hub, *, services: bool) -> None:
+    # More than 12 fields: what is offered, what is known of its types, and who is told.
+    def __init__(self, hub: Hub, server: str, *, services: bool) -> None:
+        self.server = server
+        # The id of this run of the server.
+        self.run = secrets.token_hex(8)
+        self.channels = Offers(Channel)
+        self.services = Offers(FoxgloveService)
         self._hub = hub
         self._with_services = services
         self._client = HubClient(hub, "channels of Foxglove", READ_ONLY)
-        self._sessions: dict[Session, Callable[[Iterable[int]], None]] = {}
-        self._graph_followers: set[Session] = set()
+        self._sessions: dict[FoxgloveSession, None] = {}
+        self._graph_followers: set[FoxgloveSession] = set()
         self._follower: Follower | None = None
-        self._ids = itertools.count(1)
-        self._service_ids = itertools.count(1)
         # All that were asked for; ``None``: not known yet.
         self._types: dict[_TypeKey, MessageType | ServiceType | None] = {}
         self._searched: set[str] = set()
         self._versions: dict[tuple[str, str], dict[str, None]] = {}
-        self._offered: dict[tuple[str, str, str], Channel] = {}
-        self._offered_services: dict[tuple[str, str], FoxgloveService] = {}
         self._warnings: dict[str, str] = {}
         # As those know it who follow it: publishers, subscribers and providers.
         self._graph: tuple[_Nodes, _Nodes, _Nodes] = ({}, {}, {})
-        # What is offered, by id.
-        self.channels: dict[int, Channel] = {}
-        # Likewise.
-        self.services: dict[int, FoxgloveService] = {}
         hub.types.on_learnt = self._learnt
 
-    def join(self, session: Session, withdrawn: Callable[[Iterable[int]], None]) -> None:
-        """Show a client all, and each change from now on; ``withdrawn`` is told the ids of channels that are gone."""
+    def join(self, session: FoxgloveSession) -> None:
+        """Show a client all, and each change from now on."""
         if self._follower is None:
             self._follower = self._hub.graph.follow(self._update)
         session.connection.push(
-            *_parted("advertise", "channels", self.channels.values()),
-            *_parted("advertiseServices", "services", self.services.values()),
+            *self.channels.parted(self.channels.by_id.values()),
+            *self.services.parted(self.services.by_id.values()),
             *(status(WARNING, text, identity) for identity, text in self._warnings.items()),
         )
-        self._sessions[session] = withdrawn
+        self._sessions[session] = None
 
-    def leave(self, session: Session) -> None:
+    def leave(self, session: FoxgloveSession) -> None:
         """The client has gone."""
         self._sessions.pop(session, None)
-        self._graph_followers.discard(session)
+        self.unfollow_graph(session)
         if not self._sessions and self._follower is not None:
             self._follower.close()
             self._follower = None
 
-    def follow_graph(self, session: Session) -> None:
+    def follow_graph(self, session: FoxgloveSession) -> None:
         """Tell a client the graph, as the others know it, and then its changes."""
         if not self._graph_followers:
             self._graph = self._nodes()
         self._graph_followers.add(session)
         session.connection.push(*graph_update(({}, {}, {}), self._graph))
 
-    def unfollow_graph(self, session: Session) -> None:
+    def unfollow_graph(self, session: FoxgloveSession) -> None:
         """Tell it no more of the graph."""
         self._graph_followers.discard(session)
 
@@ -155,7 +200,7 @@ class ChannelTable:
             return
         if not versions and channel.delivered:
             versions[channel.md5sum] = None
-            self._offered[*pair, channel.md5sum] = self._offered.pop((*pair, ""))
+            self.channels.by_key[*pair, channel.md5sum] = self.channels.by_key.pop((*pair, ""))
         versions[md5sum] = None
         if len(versions) > 1:
             text = (
@@ -178,16 +223,19 @@ class ChannelTable:
         for pair in self._versions.keys() - {*pairs}:
             del self._versions[pair]
             self._clear(_versions_id(pair))
-        channels = {(*pair, md5sum): None for pair in pairs for md5sum in self._versions.get(pair) or ("",)}
-        services: dict[tuple[str, str], None] = {}
+        channels = [(*pair, md5sum) for pair in pairs for md5sum in self._versions.get(pair) or ("",)]
+        services: list[_Key] = []
         if self._with_services:
-            services = {(each.name, each.type): None for each in graph.services.values() if is_type_name(each.type)}
+            services = [(each.name, each.type, "") for each in graph.services.values() if is_type_name(each.type)]
             self._search({each.name for each in graph.services.values() if not each.type})
         self._ask(
-            {(type_, False, md5sum) for _, type_, md5sum in channels} | {(each, True, "") for _, each in services}
+            {(type_, False, md5sum) for _, type_, md5sum in channels} | {(each, True, "") for _, each, _ in services}
         )
-        self._withdraw(channels, services)
-        self._offer(channels, services)
+        gone, news = self.channels.update({key: self._types[key[1], False, key[2]] for key in channels})
+        _, more = self.services.update({key: self._types[key[1], True, ""] for key in services})
+        self._tell(*news, *more)
+        for session in self._sessions if gone else ():
+            session.withdrawn(gone)
         if self._graph_followers:
             before, self._graph = self._graph, self._nodes()
             update = graph_update(before, self._graph)
@@ -227,38 +275,6 @@ class ChannelTable:
         """A type is known that may not have been found before."""
         if self._types.get((kind.name, False, ""), kind) is None:
             self._known((kind.name, False, ""), kind)
-
-    def _withdraw(self, channels: Mapping[Any, None], services: Mapping[Any, None]) -> None:
-        ids = [self._offered.pop(key).id for key in [*self._offered] if key not in channels]
-        if ids:
-            for each in ids:
-                del self.channels[each]
-            self._tell(message("unadvertise", channelIds=ids))
-            for withdrawn in self._sessions.values():
-                withdrawn(ids)
-        ids = [self._offered_services.pop(key).id for key in [*self._offered_services] if key not in services]
-        if ids:
-            for each in ids:
-                del self.services[each]
-            self._tell(message("unadvertiseServices", serviceIds=ids))
-
-    def _offer(self, channels: Iterable[tuple[str, str, str]], services: Iterable[tuple[str, str]]) -> None:
-        new = []
-        for topic, type_, md5sum in channels:
-            kind: Any = self._types[type_, False, md5sum]
-            if kind is not None and (topic, type_, md5sum) not in self._offered:
-                channel = Channel(next(self._ids), topic, type_, kind.md5sum, _schema(kind))
-                self._offered[topic, type_, md5sum] = self.channels[channel.id] = channel
-                new.append(channel)
-        self._tell(*_parted("advertise", "channels", new))
-        called = []
-        for name, type_ in services:
-            kind = self._types[type_, True, ""]
-            if kind is not None and (name, type_) not in self._offered_services:
-                service = FoxgloveService(next(self._service_ids), name, kind)
-                self._offered_services[name, type_] = self.services[service.id] = service
-                called.append(service)
-        self._tell(*_parted("advertiseServices", "services", called))
 
     def _nodes(self) -> tuple[_Nodes, _Nodes, _Nodes]:
         topics, services = self._hub.graph.topics.values(), self._hub.graph.services.values()
@@ -315,21 +331,3 @@ def _type_id(key: _TypeKey) -> str:
 
 def _versions_id(pair: tuple[str, str]) -> str:
     return f"versions of {pair[1]} on {pair[0]}"
-
-
-def _parted(op: str, key: str, items: Iterable[Channel | FoxgloveService]) -> Iterator[OutFrame]:
-    """Messages that list these, each with up to ``limits.ADVERTISE_BYTES`` of schemas, or one of them."""
-    part: list[dict[str, object]] = []
-    total = 0
-    for item in items:
-        if isinstance(item, Channel):
-            size = len(item.schema)
-        else:
-            size = len(item.kind.request.definition) + len(item.kind.response.definition)
-        if part and total + size > limits.ADVERTISE_BYTES:
-            yield message(op, **{key: part})
-            part, total = [], 0
-        part.append(item.json())
-        total += size
-    if part:
-        yield message(op, **{key: part})

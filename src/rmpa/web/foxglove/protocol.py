@@ -19,13 +19,14 @@ from msgspec import UNSET, Meta, UnsetType
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.limits import INT32_MAX, INT32_MIN, UINT32_MAX
-from rmpa.web.clients.frame_writer import Opcode
 from rmpa.web.foxglove import limits
+from rmpa.web.hub.frame_writer import Opcode
+from rmpa.web.hub.params import as_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import ParamValue, Payload
 
 # The names of the WebSocket subprotocol, preferred first; the messages here are the same in both.
@@ -212,26 +213,14 @@ def to_parameter(name: str, value: ParamValue) -> FoxgloveParameter:
     """
     if value is None:
         return FoxgloveParameter(name=name)
-    if isinstance(value, bytes):
-        return FoxgloveParameter(name=name, type="byte_array", value=base64.b64encode(value).decode())
     kind: _ParameterType | UnsetType = UNSET
-    if isinstance(value, float) and math.isfinite(value):
+    if isinstance(value, bytes):
+        kind = "byte_array"
+    elif isinstance(value, float) and math.isfinite(value):
         kind = "float64"
     elif isinstance(value, list) and value and all(isinstance(each, float) and math.isfinite(each) for each in value):
         kind = "float64_array"
-    return FoxgloveParameter(name=name, type=kind, value=_to_json(value))
-
-
-def _to_json(value: ParamValue) -> object:
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode()
-    if isinstance(value, list):
-        return [_to_json(each) for each in value]
-    if isinstance(value, dict):
-        return {key: _to_json(each) for key, each in value.items()}
-    return value
+    return FoxgloveParameter(name=name, type=kind, value=as_json(value, lambda data: base64.b64encode(data).decode()))
 
 
 def from_parameter(parameter: FoxgloveParameter) -> ParamValue:

@@ -14,16 +14,16 @@ import msgspec
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name, is_type_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import ClientStream, Session, decoder_of, ops_of
 from rmpa.web.foxglove import limits, protocol
 from rmpa.web.foxglove.protocol import ENCODING, ERROR, WARNING, message, status
+from rmpa.web.hub.connection import ClientStream, Session, decoder_of, ops_of
 from rmpa.web.hub.params import CLOCK, CLOCK_TYPE, clock_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
-    from rmpa.web.clients.frame_writer import OutFrame
     from rmpa.web.foxglove.channels import Channel, ChannelTable
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, ParamValue, Payload, Rights
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
@@ -44,7 +44,7 @@ class _Subscription(ClientStream):
         self.topic = channel.topic
         self.subscription: ClientSubscription | None = None
 
-    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:  # noqa: ARG002
+    def frames(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frame of a message; none of another version of its type."""
         channel = self.channel
         if message.md5sum not in ("", channel.md5sum):
@@ -69,7 +69,7 @@ class _Clock(ClientStream):
     def __init__(self, session: FoxgloveSession) -> None:
         self._session = session
 
-    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:  # noqa: ARG002
+    def frames(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The server's time."""
         time_ns = clock_ns(message.payload)
         if time_ns is None:
@@ -84,28 +84,17 @@ class FoxgloveSession(Session):
     Args:
         hub: The hub.
         rights: What the client may do.
-        priority: The priority of a topic's messages.
         address: The client's, for logs.
         table: What all clients are offered.
-        server: The server's name, for users, and the id of this run of it.
     """
 
     kind = "foxglove"
     frame_max = limits.BINARY_MAX
 
     # More than 12 fields: what the client has of each kind.
-    def __init__(
-        self,
-        hub: Hub,
-        rights: Rights,
-        priority: Callable[[str], int],
-        address: str,
-        table: ChannelTable,
-        server: tuple[str, str],
-    ) -> None:
-        super().__init__(hub, rights, priority, address)
+    def __init__(self, hub: Hub, rights: Rights, address: str, table: ChannelTable) -> None:
+        super().__init__(hub, rights, address)
         self.table = table
-        self._server = server
         # The time by ``/clock``, where that gives it: it stamps the messages.
         self.time_ns: int | None = None
         self._now = 0.0
@@ -125,14 +114,14 @@ class FoxgloveSession(Session):
         offered = {"clientPublish": control, "parameters": view, "parametersSubscribe": view, "services": control}
         offered |= {"time": simulated, "connectionGraph": True, "assets": view}
         about = {
-            "name": self._server[0],
+            "name": self.table.server,
             "capabilities": [each for each, given in offered.items() if given],
             "supportedEncodings": [ENCODING],
             "metadata": {"ROS_DISTRO": "noetic"},  # a client knows by it that the data are ROS 1's
-            "sessionId": self._server[1],
+            "sessionId": self.table.run,
         }
         self.connection.push(message("serverInfo", **about))
-        self.table.join(self, self._withdrawn)
+        self.table.join(self)
         if simulated:
             self.subscribe(CLOCK, CLOCK_TYPE, partial(self.connection.push_message, _Clock(self)), self._tell)
 
@@ -164,7 +153,7 @@ class FoxgloveSession(Session):
         """Send a warning, which a later one of the same subject replaces."""
         self.connection.push(status(WARNING, text, subject))
 
-    def _withdrawn(self, channels: Iterable[int]) -> None:
+    def withdrawn(self, channels: Iterable[int]) -> None:
         """These channels have ended, and their subscriptions with them."""
         gone = {*channels}
         for number, subscription in [*self._subscriptions.items()]:
@@ -217,7 +206,7 @@ class FoxgloveSession(Session):
         self._each(self._subscribe, subscriptions)
 
     def _subscribe(self, wanted: protocol.FoxgloveSubscription) -> None:
-        channel = self.table.channels.get(wanted.channel_id)
+        channel = self.table.channels.by_id.get(wanted.channel_id)
         if channel is None:
             raise RmpaError(f"there is no channel {wanted.channel_id}; its topic may be gone")
         if wanted.id in self._subscriptions:
@@ -302,7 +291,7 @@ class FoxgloveSession(Session):
 
     def _service_call(self, number: int, encoding: str, payload: Payload) -> Coroutine[Any, Any, Payload]:
         self.check_control("call services")
-        service = self.table.services.get(number)
+        service = self.table.services.by_id.get(number)
         if service is None:
             raise RmpaError(f"there is no service {number}; it may be gone")
         if encoding != ENCODING:

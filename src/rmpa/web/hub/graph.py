@@ -17,6 +17,7 @@ from rmpa.observe.graph import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response
 from rmpa.ros.node.fetch_type import fetch_type
+from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import UnknownTypeError, known_text
 from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, known_services
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.ros.node.node import Node
+    from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.node_link import NodeLink
     from rmpa.web.hub.services import ServiceCalls
+    from rmpa.web.hub.topics import ReceivedMessage
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -247,6 +250,10 @@ class TypeLibrary:
         """
         return self._versions.get((name, md5sum)) or self.message(name)
 
+    def codec(self, message: ReceivedMessage) -> MessageCodec:
+        """Converts a message that was received; raises as ``version``."""
+        return codec_for(self.version(message.type, message.md5sum))
+
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""
         kind = self._services.get(name)
@@ -417,8 +424,7 @@ class GraphWatch(GraphTable):
 
     def follow(self, changed: Callable[[], None]) -> Follower:
         """Call ``changed`` at each change; now, too, where the graph is known."""
-        follower = Follower(self._followers)
-        self._followers[follower] = changed
+        follower = Follower(self._followers, changed)
         if self.loaded.is_set():
             changed()
         return follower

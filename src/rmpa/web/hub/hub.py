@@ -11,23 +11,26 @@ import weakref
 from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 
 from rmpa.config.peer_rules import Access
+from rmpa.core.contract import Priority
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
+from rmpa.web.hub.frame_writer import size_of
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
-from rmpa.web.hub.params import ParamMirror, RosTime, value_at
-from rmpa.web.hub.services import ServedServices, ServiceCalls, read_asset
-from rmpa.web.hub.topics import HubTopics
+from rmpa.web.hub.params import ParamMirror, RosTime, ros_time, value_at
+from rmpa.web.hub.services import ServedService, ServiceCalls, read_asset
+from rmpa.web.hub.topics import HubTopics, MadeOnce
 from rmpa.web.hub.transforms import TransformTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
+    from rmpa.core.contract import Contracts
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
-    from rmpa.web.hub.services import ServedService
     from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
 _log = logging.getLogger(__name__)
@@ -37,7 +40,7 @@ _WHO: Final = "the web server"
 _COUNT: Final = "/client_count"
 _CLIENTS: Final = "/connected_clients"
 _TYPES: Final = {_COUNT: "std_msgs/Int32", _CLIENTS: "rosbridge_msgs/ConnectedClients"}
-_NANO: Final = 1_000_000_000
+_PRIORITIES: Final = {Priority.HIGH: 1, Priority.NORMAL: 0, Priority.LOW: -1}
 
 
 class Hub:
@@ -47,21 +50,33 @@ class Hub:
         where: Finds the master.
         make_node: Makes the node; it is made anew when the master was away or has shut it down.
         rules: What the node may do.
+        contracts: Of topics.
     """
 
     # More than 12 fields: the parts, each once.
-    def __init__(self, where: Where, make_node: MakeNode, *, rules: NodeRules = EVERYTHING) -> None:
+    def __init__(
+        self,
+        where: Where,
+        make_node: MakeNode,
+        *,
+        rules: NodeRules = EVERYTHING,
+        contracts: Contracts | None = None,
+    ) -> None:
+        self._contracts = contracts
         self._started = False
         self._clients: dict[HubClient, None] = {}
         self.link = NodeLink(where, make_node, rules)
         self.params = ParamMirror(self.link)
         self.types = TypeLibrary(self.link)
         self.calls = ServiceCalls(self.link)
-        self.served = ServedServices(self.link)
+        self.served: dict[str, ServedService] = {}
         self.graph = GraphWatch(self.link, self.calls, self.params.reload)
-        self.topics = HubTopics(self.link, self.types, self.graph, time.time_ns)
-        self.time = RosTime(self.topics, self.params, time.time_ns)
-        self.counts = ClientCounts(self, time.time_ns)
+        self.topics = HubTopics(self.link, self.types, self.graph)
+        self.time = RosTime(self.topics, self.params)
+        self.counts = ClientCounts(self)
+        # What rosbridge's clients are sent.
+        self.frames: MadeOnce[OutFrame] = MadeOnce(limits.FRAMES_KEPT_BYTES, size_of)
+        self._values: MadeOnce[Any] = MadeOnce(limits.VALUES_KEPT_BYTES)
         self.transforms = TransformTree(self.topics, self.types)
 
     async def __aenter__(self) -> Self:
@@ -93,8 +108,25 @@ class Hub:
         for part in (self.graph, self.params, self.types, self.calls, self.link):
             await part.close()
         self.topics.close()
-        self.served.close()
+        for served in [*self.served.values()]:
+            served.close()
         await self.link.withdrawn()
+
+    def values(self, message: ReceivedMessage) -> Any:
+        """The values of a message, which all share: a map of 16 million cells is no list, but a view.
+
+        Raises:
+            RmpaError: Its type is not known, or its bytes are not a message of that type.
+        """
+        return self._values.get(message.payload, lambda: self.types.codec(message).views(message.payload))
+
+    def priority(self, topic: str) -> int:
+        """The priority of a topic's messages, by its contract: higher ones go first."""
+        if self._contracts is None:
+            return 0
+        known = self.graph.topics.get(topic)
+        type_ = known.types[0] if known is not None and known.types else ""
+        return _PRIORITIES[self._contracts.of(topic, type_).priority]
 
     @property
     def clients(self) -> tuple[HubClient, ...]:
@@ -159,7 +191,7 @@ class HubClient:
         differs: Callable[[str], None] = lambda _: None,
     ) -> ClientSubscription:
         """Subscribe to a topic; see ``HubTopics.subscribe``."""
-        subscribed = self.hub.topics.names
+        subscribed = self.hub.topics.subscribed
         if len(subscribed) >= limits.SUBSCRIBED_TOPICS_MAX and topic not in subscribed:
             known = self.hub.graph.topics.get(topic)
             if known is None or not known.publishers:
@@ -172,9 +204,9 @@ class HubClient:
     def advertise(
         self, topic: str, type_: str, failed: Callable[[RmpaError], None], *, latch: bool = False
     ) -> ClientPublication:
-        """Publish a topic; see ``Publishers.advertise``."""
+        """Publish a topic; see ``HubTopics.advertise``."""
         self.check_control("publish")
-        made = self.hub.topics.publishers.advertise(topic, type_, failed, latch=latch, accepts=self._accepts)
+        made = self.hub.topics.advertise(topic, type_, failed, latch=latch, accepts=self._accepts)
         self._open.add(made)
         return made
 
@@ -204,9 +236,10 @@ class HubClient:
         called: Callable[[bytes, asyncio.Future[Payload]], None],
         failed: Callable[[RmpaError], None],
     ) -> ServedService:
-        """Offer a service; see ``ServedServices.serve``."""
+        """Offer a service; see ``ServedService``."""
         self.check_control("offer services")
-        made = self.hub.served.serve(service, self.hub.types.service(type_), called, failed)
+        hub = self.hub
+        made = ServedService(hub.link, hub.served, service, hub.types.service(type_), called, failed)
         self._open.add(made)
         return made
 
@@ -230,7 +263,7 @@ class HubClient:
         """The values of ``names`` that are there; without names those of all parameters."""
         self._check_view("read parameters")
         await self.hub.params.loaded.wait()
-        return self.hub.link.rules.visible(self.hub.params.values(names, "/"))
+        return self.hub.link.rules.visible(self.hub.params.values(names))
 
     def set_param(self, name: str, value: ParamValue) -> Coroutine[Any, Any, None]:
         """Set a parameter; see ``ParamMirror.set``."""
@@ -304,20 +337,16 @@ class ClientCounts:
 
     Args:
         hub: Publishes them.
-        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, hub: Hub, now_ns: Callable[[], int]) -> None:
+    def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._now_ns = now_ns
         self._clients: dict[HubClient, dict[str, Any]] = {}
         self._publications: list[ClientPublication] | None = None
 
     def add(self, client: HubClient, address: str) -> None:
         """A client is there."""
-        seconds, nanoseconds = divmod(self._now_ns(), _NANO)
-        time = {"secs": seconds, "nsecs": nanoseconds}
-        self._clients[client] = {"ip_address": address, "connection_time": time}
+        self._clients[client] = {"ip_address": address, "connection_time": ros_time(time.time_ns())}
         self._publish()
 
     def remove(self, client: HubClient) -> None:
@@ -330,7 +359,7 @@ class ClientCounts:
             self._publications = []
             for topic, type_ in _TYPES.items():
                 with contextlib.suppress(PeerRefused):  # a client publishes that topic with another type
-                    made = self._hub.topics.publishers.advertise(topic, type_, self._refused, latch=True)
+                    made = self._hub.topics.advertise(topic, type_, self._refused, latch=True)
                     self._publications.append(made)
         clients = [*self._clients.values()]
         values = {_COUNT: {"data": len(clients)}, _CLIENTS: {"clients": clients}}

@@ -167,10 +167,12 @@ class Follower:
 
     Args:
         followers: All of one kind, with what is called for each.
+        followed: What is called for this one.
     """
 
-    def __init__(self, followers: dict[Follower, Any]) -> None:
-        self._followers = followers
+    def __init__(self, followers: dict[Follower, _U], followed: _U) -> None:
+        self._followers: dict[Follower, Any] = followers
+        followers[self] = followed
 
     def close(self) -> None:
         """Follow no more."""

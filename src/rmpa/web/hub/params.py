@@ -6,9 +6,11 @@ import asyncio
 import contextlib
 import functools
 import logging
+import math
 import struct
+import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.master.parameters import Parameters, leaves
@@ -29,6 +31,7 @@ CLOCK: Final = "/clock"
 CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _PARAM: Final = "/use_sim_time"
 _TIME: Final = struct.Struct("<II")
+_NANO: Final = 1_000_000_000
 
 
 class ParamMirror:
@@ -64,12 +67,11 @@ class ParamMirror:
         except KeyError:
             return None
 
-    def values(self, names: tuple[str, ...], prefix: str) -> dict[str, ParamValue]:
-        """The values of ``names`` that exist; without names those of all parameters below ``prefix``."""
+    def values(self, names: tuple[str, ...] = ()) -> dict[str, ParamValue]:
+        """The values of ``names`` that exist; without names those of all parameters."""
         if names:
             return {name: value for name in names if (value := self.value(name)) is not None}
-        value = self.value(prefix)
-        return dict(leaves(prefix.rstrip("/"), value)) if value is not None else {}
+        return dict(leaves("", self.value("/")))
 
     def updated(self, key: str, value: XmlRpcValue) -> None:
         """The master tells a change; ``{}`` for a parameter that was deleted."""
@@ -104,9 +106,7 @@ class ParamMirror:
 
     def follow(self, names: tuple[str, ...], changed: Callable[[Mapping[str, ParamValue]], None]) -> Follower:
         """Call ``changed`` with each change of ``names``, or of all; ``None`` is a parameter that was deleted."""
-        follower = Follower(self._followers)
-        self._followers[follower] = names, changed
-        return follower
+        return Follower(self._followers, (names, changed))
 
     def reload(self) -> None:
         """Read everything anew: the master was away."""
@@ -192,6 +192,19 @@ class ParamMirror:
                 changed(told)
 
 
+def as_json(value: object, binary: Callable[[bytes], str]) -> Any:
+    """A parameter for JSON: what that lacks (NaN, infinities, dates) as text; bytes as ``binary`` makes of them."""
+    if isinstance(value, Mapping):
+        return {str(key): as_json(inner, binary) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(inner, binary) for inner in value]
+    if isinstance(value, bytes | bytearray | memoryview):
+        return binary(bytes(value))
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
 def _same(one: object, other: object) -> bool:
     """Whether two values are equal and of the same types: 1 is not 1.0, nor True."""
     if one is other:
@@ -234,12 +247,10 @@ class RosTime:
     Args:
         topics: The hub's subscriptions.
         params: The parameters.
-        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, topics: HubTopics, params: ParamMirror, now_ns: Callable[[], int]) -> None:
+    def __init__(self, topics: HubTopics, params: ParamMirror) -> None:
         self._topics = topics
-        self._now_ns = now_ns
         self._clock: ClientSubscription | None = None
         self._sim_ns = 0
         params.follow((_PARAM,), lambda values: self._use(bool(values.get(_PARAM))))
@@ -251,7 +262,7 @@ class RosTime:
 
     def now_ns(self) -> int:
         """Nanoseconds; 0 until the first message of ``/clock`` where that gives the time, as in rospy."""
-        return self._sim_ns if self.simulated else self._now_ns()
+        return self._sim_ns if self.simulated else time.time_ns()
 
     def _use(self, simulated: bool) -> None:
         if self._clock is not None and not simulated:
@@ -266,9 +277,15 @@ class RosTime:
         self._sim_ns = clock_ns(message.payload) or self._sim_ns
 
 
+def ros_time(now_ns: int) -> dict[str, int]:
+    """A time of ROS, of nanoseconds."""
+    seconds, nanoseconds = divmod(max(0, now_ns), _NANO)
+    return {"secs": seconds, "nsecs": nanoseconds}
+
+
 def clock_ns(payload: memoryview) -> int | None:
     """The time of a message of ``/clock`` in nanoseconds; ``None`` for another message."""
     if len(payload) != _TIME.size:
         return None
     seconds, nanoseconds = _TIME.unpack(payload)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return int(seconds) * _NANO + int(nanoseconds)

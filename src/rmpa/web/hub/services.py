@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import os
 from collections import defaultdict, deque
 from dataclasses import dataclass, field
@@ -136,95 +135,73 @@ def _is_package(folder: Path) -> bool:
     return any((folder / name).is_file() for name in _MANIFESTS)
 
 
-@dataclass(slots=True, eq=False, weakref_slot=True)
 class ServedService:
-    """A service that a client offers, from ``ServedServices.serve``."""
+    """A service that a client offers: the node serves it, and each call is handed to its client.
 
-    services: ServedServices
-    name: str
-    kind: ServiceType
-    called: Callable[[bytes, asyncio.Future[Payload]], None]
-    failed: Callable[[RmpaError], None]
-    registration: Registration[Service] = field(init=False)
-    calls: set[asyncio.Future[Payload]] = field(default_factory=set)
-
-    def close(self, reason: str = "") -> None:
-        """Offer it no more; its open calls fail."""
-        self.services.end(self, reason or f"the client that offers {self.name} has ended it")
-
-
-class ServedServices:
-    """All services that clients offer: the node serves them, and hands each call to its client.
+    A client that offers it already loses it, which may have gone without a word.
 
     Args:
         link: Has the node.
+        served: All such services, by name.
+        name: The global name.
+        kind: Its type.
+        called: ``(request, response)``: hands a call to the client, which sets the response or an exception.
+        failed: Called where the service cannot be registered, or another client offers it; it has then ended.
+
+    Raises:
+        PeerRefused: The rules deny it.
     """
 
-    def __init__(self, link: NodeLink) -> None:
-        self._link = link
-        self._served: dict[str, ServedService] = {}
-
-    def serve(
+    def __init__(
         self,
+        link: NodeLink,
+        served: dict[str, ServedService],
         name: str,
         kind: ServiceType,
         called: Callable[[bytes, asyncio.Future[Payload]], None],
         failed: Callable[[RmpaError], None],
-    ) -> ServedService:
-        """Offer a service; a client that offers it already loses it, which may have gone without a word.
+    ) -> None:
+        link.rules.check(Access.SERVE, name)
+        self._name = name
+        self._kind = kind
+        self._called = called
+        self._failed = failed
+        self._served = served
+        self._calls: set[asyncio.Future[Payload]] = set()
+        if (old := served.get(name)) is not None:
+            old.refused(RmpaError(f"another client offers {name} now"))
+        served[name] = self
+        self._registration: Registration[Service] = Registration(link, "service", name, self._register, self.refused)
 
-        Args:
-            name: The global name.
-            kind: Its type.
-            called: ``(request, response)``: hands a call to the client, which sets the response or an exception.
-            failed: Called where the service cannot be registered, or another client offers it; it has then ended.
-
-        Raises:
-            PeerRefused: The rules deny it.
-        """
-        self._link.rules.check(Access.SERVE, name)
-        if (old := self._served.get(name)) is not None:
-            self._refused(old, RmpaError(f"another client offers {name} now"))
-        served = self._served[name] = ServedService(self, name, kind, called, failed)
-        register = functools.partial(self._register, served)
-        refused = functools.partial(self._refused, served)
-        served.registration = Registration(self._link, "service", name, register, refused)
-        return served
-
-    def end(self, served: ServedService, reason: str) -> None:
-        """End a service, once; its open calls fail."""
-        if self._served.get(served.name) is not served:
+    def close(self, reason: str = "") -> None:
+        """Offer it no more, once; its open calls fail."""
+        if self._served.get(self._name) is not self:
             return
-        del self._served[served.name]
-        for response in served.calls:
+        del self._served[self._name]
+        for response in self._calls:
             if not response.done():
-                response.set_exception(RmpaError(reason))
-        served.registration.end()
+                response.set_exception(RmpaError(reason or f"the client that offers {self._name} has ended it"))
+        self._registration.end()
 
-    def close(self) -> None:
-        """End all."""
-        for served in [*self._served.values()]:
-            served.close()
+    async def _register(self, node: Node) -> Service:
+        return await node.advertise_service(self._name, self._kind, self._call, timeout=60.0, raw=True)
 
-    async def _register(self, served: ServedService, node: Node) -> Service:
-        handler = functools.partial(self._call, served)
-        return await node.advertise_service(served.name, served.kind, handler, timeout=60.0, raw=True)
-
-    async def _call(self, served: ServedService, request: bytes) -> Payload:
-        if len(served.calls) >= limits.SERVED_CALLS_MAX:
-            raise RmpaError(f"{len(served.calls)} calls of {served.name} wait for its client, which is the limit")
+    async def _call(self, request: bytes) -> Payload:
+        if len(self._calls) >= limits.SERVED_CALLS_MAX:
+            raise RmpaError(f"{len(self._calls)} calls of {self._name} wait for its client, which is the limit")
         response: asyncio.Future[Payload] = asyncio.get_running_loop().create_future()
-        served.calls.add(response)
+        self._calls.add(response)
         try:
-            served.called(request, response)
+            self._called(request, response)
             return await response
         finally:
-            served.calls.discard(response)
+            self._calls.discard(response)
 
-    def _refused(self, served: ServedService, error: RmpaError) -> None:
-        if self._served.get(served.name) is served:
-            served.close()
-            served.failed(error)
+    def refused(self, error: RmpaError) -> None:
+        """It cannot be offered: it ends, and its client is told."""
+        if self._served.get(self._name) is self:
+            self.close()
+            self._failed(error)
 
 
 @dataclass(slots=True, eq=False)

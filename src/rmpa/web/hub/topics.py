@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import logging
+import time
 import weakref
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
@@ -23,7 +23,7 @@ from rmpa.web import limits
 from rmpa.web.hub.node_link import Registration
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, KeysView, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Publisher, Subscriber
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from rmpa.web.hub.node_link import NodeLink, Payload
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+_User = TypeVar("_User", "ClientSubscription", "ClientPublication")
 
 
 class PayloadBuffers:
@@ -94,6 +96,41 @@ def _has_views(buffer: bytearray) -> bool:
     return False
 
 
+class MadeOnce(Generic[_T]):
+    """What is made of messages, once for all clients: these get a topic's message at nearly the same time.
+
+    A message is recognised by its payload, which is the same memoryview for all.
+
+    Args:
+        most_bytes: Of the messages that are kept, and of what was made of them.
+        size: Bytes of what was made of one.
+    """
+
+    def __init__(self, most_bytes: int, size: Callable[[_T], int] = lambda _: 0) -> None:
+        self._most = most_bytes
+        self._size = size
+        self._kept: OrderedDict[tuple[object, ...], tuple[Payload, int, _T]] = OrderedDict()
+        # Bytes of all that is kept.
+        self.bytes = 0
+
+    def get(self, payload: memoryview, make: Callable[[], _T], *how: object) -> _T:
+        """What was made of a message in one way; it is shared, and must not be changed. Raises as ``make``."""
+        key = (id(payload), *how)
+        kept = self._kept.get(key)
+        if kept is not None:
+            # The payload is kept too, so its id cannot have been given to another.
+            self._kept.move_to_end(key)
+            return kept[2]
+        made = make()
+        size = self._size(made) + len(payload)
+        if size <= self._most:
+            self._kept[key] = payload, size, made
+            self.bytes += size
+            while self.bytes > self._most or len(self._kept) > limits.MADE_KEPT:
+                self.bytes -= self._kept.popitem(last=False)[1][1]
+        return made
+
+
 # The source of what clients of this hub publish: the node has no connection to itself.
 OWN: Final = ""
 
@@ -116,12 +153,65 @@ class ReceivedMessage(msgspec.Struct, frozen=True):
     md5sum: str = ""
 
 
+class _Shared(Generic[_User]):
+    """A topic that clients subscribe to, or publish, together: it stays while it has users, and a while longer.
+
+    Args:
+        table: All of its kind, by name.
+        name: The topic.
+    """
+
+    registration: Registration[Any]
+
+    def __init__(self, table: dict[str, Any], name: str) -> None:
+        self.name = name
+        self.users: dict[_User, None] = {}
+        self._table = table
+        self._timer: asyncio.TimerHandle | None = None
+        table[name] = self
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it has not ended."""
+        return self._table.get(self.name) is self
+
+    def use(self, user: _User) -> None:
+        """It has one more user."""
+        self._keep()
+        self.users[user] = None
+
+    def leave(self, user: _User, linger: float) -> None:
+        """A user has gone, once; the last one's stays for so many seconds."""
+        if user in self.users:
+            del self.users[user]
+            if not self.users and self.is_there:
+                self._timer = asyncio.get_running_loop().call_later(linger, self.end)
+
+    def refused(self, error: RmpaError) -> None:
+        """The master refuses it: it ends, and its users are told."""
+        if self.is_there:
+            users, self.users = self.users, {}
+            self.end()
+            for each in users:
+                each.failed(error)
+
+    def end(self) -> None:
+        """End it, whoever uses it."""
+        self._keep()
+        del self._table[self.name]
+        self.registration.end()
+
+    def _keep(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
 @dataclass(slots=True, eq=False, weakref_slot=True)
 class ClientSubscription:
     """One subscription of one client, from ``HubTopics.subscribe``."""
 
-    topics: HubTopics
-    topic: str
+    there: _Topic
     type: str | None
     receive: Callable[[ReceivedMessage], None]
     failed: Callable[[RmpaError], None]
@@ -131,7 +221,30 @@ class ClientSubscription:
 
     def close(self) -> None:
         """End it; the last one's topic lingers for ``limits.SUBSCRIPTION_LINGER``."""
-        self.topics.unsubscribe(self)
+        self.there.leave(self, limits.SUBSCRIPTION_LINGER)
+
+
+@dataclass(slots=True, eq=False, weakref_slot=True)
+class ClientPublication:
+    """One client's share of a publisher, from ``HubTopics.advertise``."""
+
+    there: _Publisher
+    failed: Callable[[RmpaError], None]
+    accepts: Callable[[str], bool]
+
+    @property
+    def topic(self) -> str:
+        """The topic."""
+        return self.there.name
+
+    def publish(self, payload: Payload) -> None:
+        """Publish a message, numbered. The payload must not change afterwards."""
+        if self.accepts(self.topic) and self in self.there.users and self.there.is_there:
+            self.there.publish(payload)
+
+    def close(self) -> None:
+        """Leave the publisher; the last one's is withdrawn after ``limits.UNADVERTISE_DELAY``."""
+        self.there.leave(self, limits.UNADVERTISE_DELAY)
 
 
 @dataclass(slots=True, eq=False)
@@ -143,44 +256,27 @@ class _Latched:
     had: weakref.WeakSet[ClientSubscription] = field(default_factory=weakref.WeakSet)
 
 
-@dataclass(slots=True, eq=False)
-class _Topic:
-    name: str
-    registration: Registration[Subscriber] = field(init=False)
-    subscriptions: dict[ClientSubscription, None] = field(default_factory=dict)
-    # The type that it is registered with; ``None``: any.
-    kind: MessageType | None = None
-    linger: asyncio.TimerHandle | None = None
-    # The last header of each publisher, by its name.
-    headers: dict[str, Mapping[str, str]] = field(default_factory=dict)
-
-
 class HubTopics:
-    """All subscriptions, and what clients of the hub publish to each other.
+    """All topics that clients of the hub subscribe to and publish: for each one subscription and one publisher.
 
     Args:
         link: Has the node.
         types: Is told the headers of publishers, and knows the types.
         graph: Likewise, and the topics.
-        now_ns: The wall clock, in nanoseconds.
     """
 
-    def __init__(self, link: NodeLink, types: TypeLibrary, graph: GraphWatch, now_ns: Callable[[], int]) -> None:
-        self._link = link
-        self._types = types
-        self._graph = graph
-        self._now_ns = now_ns
-        self._topics: dict[str, _Topic] = {}
+    def __init__(self, link: NodeLink, types: TypeLibrary, graph: GraphWatch) -> None:
+        self.link = link
+        self.types = types
+        self.graph = graph
+        # The topics that are subscribed to, those included that linger.
+        self.subscribed: dict[str, _Topic] = {}
+        # The published topics, those included that wait for their withdrawal.
+        self.published: dict[str, _Publisher] = {}
         # The last messages of latching sources, by topic and source, the oldest first.
-        self._latched: OrderedDict[tuple[str, str], _Latched] = OrderedDict()
-        self._buffers = PayloadBuffers()
-        self.publishers = Publishers(link, types, self, now_ns)
+        self.latched: OrderedDict[tuple[str, str], _Latched] = OrderedDict()
+        self.buffers = PayloadBuffers()
         graph.follow(self._graph_changed)
-
-    @property
-    def names(self) -> KeysView[str]:
-        """The topics that are subscribed to, those included that linger."""
-        return self._topics.keys()
 
     def subscribe(
         self,
@@ -202,226 +298,14 @@ class HubTopics:
         Raises:
             PeerRefused: The rules deny it.
         """
-        self._link.rules.check(Access.SUBSCRIBE, topic)
-        made = ClientSubscription(self, topic, None if type_ == ANY else type_, receive, failed, differs)
-        there = self._topics.get(topic)
-        if there is None:
-            there = self._topics[topic] = _Topic(topic)
-            there.registration = self._registration(there)
-            if (own := self.publishers.latched(topic)) is not None:
-                self._keep(_Latched(own, {}))
-        if there.linger is not None:
-            there.linger.cancel()
-            there.linger = None
-        there.subscriptions[made] = None
+        self.link.rules.check(Access.SUBSCRIBE, topic)
+        there = self.subscribed.get(topic) or _Topic(self, topic)
+        made = ClientSubscription(there, None if type_ == ANY else type_, receive, failed, differs)
+        there.use(made)
         loop = asyncio.get_running_loop()
-        loop.call_soon(self._replay, there, made)
-        loop.call_soon(self._judge, there)
+        loop.call_soon(there.replay, made)
+        loop.call_soon(there.judge)
         return made
-
-    def unsubscribe(self, subscription: ClientSubscription) -> None:
-        """End a subscription, once."""
-        there = self._topics.get(subscription.topic)
-        if there is None or subscription not in there.subscriptions:
-            return
-        del there.subscriptions[subscription]
-        if not there.subscriptions:
-            there.linger = asyncio.get_running_loop().call_later(limits.SUBSCRIPTION_LINGER, self._end, there)
-
-    def publish_own(self, message: ReceivedMessage, *, latch: bool) -> None:
-        """Deliver what a client of this hub publishes, to which the node itself does not subscribe."""
-        there = self._topics.get(message.topic)
-        if there is not None:
-            self._deliver(there, message, {} if latch else None)
-
-    def forget_own(self, topic: str) -> None:
-        """Forget the latched message of the hub's own publisher, which has ended."""
-        self._latched.pop((topic, OWN), None)
-
-    def close(self) -> None:
-        """End all."""
-        for there in [*self._topics.values()]:
-            self._end(there)
-        self.publishers.close()
-
-    def _registration(self, there: _Topic) -> Registration[Subscriber]:
-        register = functools.partial(self._register, there)
-        return Registration(self._link, "topic", there.name, register, functools.partial(self._refused, there))
-
-    async def _register(self, there: _Topic, node: Node) -> Subscriber:
-        take = functools.partial(self._take, there)
-        return await node.subscribe(there.name, there.kind, on_bytes=take, own=False)
-
-    def _graph_changed(self) -> None:
-        for there in [*self._topics.values()]:
-            self._judge(there)
-
-    def _judge(self, there: _Topic) -> None:
-        """Compare the types that are wanted with those that are published.
-
-        Where nothing of a topic can be delivered, it is subscribed to with the type that is wanted: its publishers
-        then refuse the connection as they refuse any node's, so that no message is sent in vain, and ``rmpa why`` and
-        the diagnostics name the mismatch.
-        """
-        if self._topics.get(there.name) is not there:
-            return
-        topic = self._graph.topics.get(there.name)
-        types = topic.types if topic is not None and topic.publishers else ()
-        wanted = {each.type for each in there.subscriptions}
-        for each in [*there.subscriptions] if types else ():
-            if each.type is not None and each.type not in types and types[0] not in each.told:
-                each.told.add(types[0])
-                each.differs(types[0])
-        unfit = types and len(wanted) == 1 and not wanted & {None, *types}
-        kind = self._types.at_hand(next(iter(wanted)) or "") if unfit else None
-        if kind is not there.kind:
-            there.kind = kind
-            there.registration.end()
-            there.registration = self._registration(there)
-
-    def _refused(self, there: _Topic, error: RmpaError) -> None:
-        if self._topics.get(there.name) is there:
-            subscriptions = [*there.subscriptions]
-            self._end(there)
-            for each in subscriptions:
-                each.failed(error)
-
-    def _end(self, there: _Topic) -> None:
-        if there.linger is not None:
-            there.linger.cancel()
-        for key in [key for key in self._latched if key[0] == there.name]:
-            del self._latched[key]
-        del self._topics[there.name]
-        there.registration.end()
-        if not self._topics:
-            self._buffers.clear()
-
-    def _take(self, there: _Topic, data: memoryview, header: Mapping[str, str]) -> None:
-        if self._topics.get(there.name) is not there:
-            return  # it has ended, and is being withdrawn
-        stamp_ns = self._now_ns()
-        source, type_ = header.get("callerid", "?"), header.get("type", "")
-        if there.headers.get(source) is not header:
-            there.headers[source] = header
-            if len(there.headers) > limits.SEEN_PUBLISHERS_MAX:
-                del there.headers[next(iter(there.headers))]
-            self._types.learn(header)
-            if type_:
-                self._graph.saw_type(there.name, type_)
-        payload = self._buffers.copy(data)
-        message = ReceivedMessage(there.name, type_, payload, stamp_ns, source, header.get("md5sum", ""))
-        self._deliver(there, message, header if header.get("latching") == "1" else None)
-
-    def _deliver(self, there: _Topic, message: ReceivedMessage, latching: Mapping[str, str] | None) -> None:
-        """Hand a message to all; ``latching`` is its publisher's header, if that latches."""
-        if latching is None:
-            _hand(message, there.subscriptions)
-            return
-        latched = self._latched.get((there.name, message.source))
-        again = latched is not None and latched.header is not latching and latched.message.payload == message.payload
-        if latched is not None and again and message.source != OWN:
-            # The publisher sends its latched message at each new connection: most have had it.
-            latched.header = latching
-        else:
-            latched = self._keep(_Latched(message, latching))
-        _hand_latched(latched, there.subscriptions)
-
-    def _keep(self, latched: _Latched) -> _Latched:
-        self._latched[latched.message.topic, latched.message.source] = latched
-        self._latched.move_to_end((latched.message.topic, latched.message.source))
-        size = sum(len(each.message.payload) for each in self._latched.values())
-        while size > limits.LATCHED_BYTES and len(self._latched) > 1:
-            size -= len(self._latched.popitem(last=False)[1].message.payload)
-        return latched
-
-    def _replay(self, there: _Topic, subscription: ClientSubscription) -> None:
-        subscriber = there.registration.value
-        connected = {OWN} | (subscriber.callers if subscriber is not None else set())
-        if subscription in there.subscriptions:
-            for (topic, source), latched in [*self._latched.items()]:
-                if topic == there.name and source in connected:
-                    _hand_latched(latched, (subscription,))
-
-
-def _hand_latched(latched: _Latched, subscriptions: Iterable[ClientSubscription]) -> None:
-    news = [each for each in subscriptions if each not in latched.had]
-    latched.had.update(each for each in news if each.type in (None, latched.message.type))
-    _hand(latched.message, news)
-
-
-def _hand(message: ReceivedMessage, subscriptions: Iterable[ClientSubscription]) -> None:
-    for each in [*subscriptions]:
-        if each.type in (None, message.type):
-            # A fault of one client must not cost the others their messages.
-            with logged_failure(_log, "a message of %s could not be delivered", message.topic):
-                each.receive(message)
-
-
-@dataclass(slots=True, eq=False, weakref_slot=True)
-class ClientPublication:
-    """One client's share of a publisher, from ``Publishers.advertise``."""
-
-    publishers: Publishers
-    topic: str
-    failed: Callable[[RmpaError], None]
-    accepts: Callable[[str], bool]
-
-    def publish(self, payload: Payload) -> None:
-        """Publish a message, numbered. The payload must not change afterwards."""
-        if self.accepts(self.topic):
-            self.publishers.publish(self, payload)
-
-    def close(self) -> None:
-        """Leave the publisher; the last one's is withdrawn after ``limits.UNADVERTISE_DELAY``."""
-        self.publishers.unadvertise(self)
-
-
-@dataclass(slots=True, eq=False)
-class _Publisher:
-    """One published topic."""
-
-    topic: str
-    type: str
-    latch: bool
-    users: set[ClientPublication]
-    # Numbers its messages; ``None`` while its type is not known.
-    numbers: HeaderNumbers | None = None
-    registration: Registration[Publisher] = field(init=False)
-    linger: asyncio.TimerHandle | None = None
-    # What was published before subscribers were connected; ``None`` from then on.
-    early: deque[tuple[float, Payload]] | None = field(default_factory=deque)
-    early_bytes: int = 0
-    latched: ReceivedMessage | None = None
-
-
-class Publishers:
-    """All published topics of the hub: one publisher of the node for each, which all clients share.
-
-    Args:
-        link: Has the node.
-        types: Finds the types.
-        subscriptions: The clients' that subscribe to the same topics.
-        now_ns: The wall clock, in nanoseconds.
-    """
-
-    def __init__(
-        self, link: NodeLink, types: TypeLibrary, subscriptions: HubTopics, now_ns: Callable[[], int]
-    ) -> None:
-        self._link = link
-        self._types = types
-        self._subscriptions = subscriptions
-        self._now_ns = now_ns
-        self._topics: dict[str, _Publisher] = {}
-
-    @property
-    def names(self) -> KeysView[str]:
-        """The published topics, those included that wait for their withdrawal."""
-        return self._topics.keys()
-
-    def latched(self, topic: str) -> ReceivedMessage | None:
-        """The last message of a latching topic."""
-        there = self._topics.get(topic)
-        return there.latched if there is not None else None
 
     def advertise(
         self,
@@ -444,115 +328,230 @@ class Publishers:
         Raises:
             PeerRefused: The rules deny it, other clients publish it with another type, or there are too many topics.
         """
-        self._link.rules.check(Access.PUBLISH, topic)
-        there = self._topics.get(topic)
-        users = there.users if there is not None else set()
+        self.link.rules.check(Access.PUBLISH, topic)
+        there = self.published.get(topic)
+        users = there.users if there is not None else {}
         if there is not None and users and there.type != type_:
             problem = f"other clients publish {topic} as {there.type}, not {type_}"
             raise PeerRefused("the web server", problem, "publish it with that type, or under another name")
         # TCPROS says at the connection whether a publisher latches.
         if there is not None and (there.type != type_ or there.latch != latch) and (latch or not users):
-            self._end(there)
+            there.end()
             there = None
         if there is None:
-            there = self._begin(topic, type_, users, latch=latch)
-        if there.linger is not None:
-            there.linger.cancel()
-            there.linger = None
-        made = ClientPublication(self, topic, failed, accepts)
-        there.users.add(made)
+            self._make_room()
+            there = _Publisher(self, topic, type_, latch=latch)
+            for each in users:
+                each.there = there
+                there.use(each)
+        made = ClientPublication(there, failed, accepts)
+        there.use(made)
         return made
 
-    def unadvertise(self, publication: ClientPublication) -> None:
-        """End a publication, once."""
-        there = self._topics.get(publication.topic)
-        if there is not None and publication in there.users:
-            there.users.remove(publication)
-            if not there.users:
-                there.linger = asyncio.get_running_loop().call_later(limits.UNADVERTISE_DELAY, self._end, there)
-
-    def publish(self, publication: ClientPublication, payload: Payload) -> None:
-        """Publish a message of a publication that has not ended."""
-        there = self._topics.get(publication.topic)
-        if there is not None and publication in there.users:
-            self._publish(there, payload)
+    def _make_room(self) -> None:
+        if len(self.published) >= limits.PUBLISHERS_MAX:
+            unused = next((each for each in self.published.values() if not each.users), None)
+            if unused is None:
+                problem = f"its clients publish {len(self.published)} topics, which is the limit"
+                raise PeerRefused("the web server", problem, "publish fewer topics")
+            unused.end()
 
     def close(self) -> None:
         """End all."""
-        for there in [*self._topics.values()]:
-            self._end(there)
+        open_: list[_Topic | _Publisher] = [*self.subscribed.values(), *self.published.values()]
+        for there in open_:
+            there.end()
 
-    def _publish(self, there: _Publisher, payload: Payload) -> None:
-        if there.numbers is None:
-            self._wait(there, payload)  # it is numbered and delivered when the type is known
+    def keep(self, latched: _Latched) -> _Latched:
+        """Keep a latched message for newcomers, as long as there is room."""
+        self.latched[latched.message.topic, latched.message.source] = latched
+        self.latched.move_to_end((latched.message.topic, latched.message.source))
+        size = sum(len(each.message.payload) for each in self.latched.values())
+        while size > limits.LATCHED_BYTES and len(self.latched) > 1:
+            size -= len(self.latched.popitem(last=False)[1].message.payload)
+        return latched
+
+    def _graph_changed(self) -> None:
+        for there in [*self.subscribed.values()]:
+            there.judge()
+
+
+class _Topic(_Shared[ClientSubscription]):
+    """A topic that clients subscribe to."""
+
+    def __init__(self, topics: HubTopics, name: str) -> None:
+        super().__init__(topics.subscribed, name)
+        self._topics = topics
+        # The type that it is registered with; ``None``: any.
+        self._kind: MessageType | None = None
+        # The last header of each publisher, by its name.
+        self._headers: dict[str, Mapping[str, str]] = {}
+        self.registration: Registration[Subscriber] = self._registered()
+        own = topics.published.get(name)
+        if own is not None and own.latched is not None:
+            topics.keep(_Latched(own.latched, {}))
+
+    def _registered(self) -> Registration[Subscriber]:
+        return Registration(self._topics.link, "topic", self.name, self._register, self.refused)
+
+    async def _register(self, node: Node) -> Subscriber:
+        return await node.subscribe(self.name, self._kind, on_bytes=self._take, own=False)
+
+    def end(self) -> None:
+        """End it, and forget what is latched."""
+        super().end()
+        for key in [key for key in self._topics.latched if key[0] == self.name]:
+            del self._topics.latched[key]
+        if not self._topics.subscribed:
+            self._topics.buffers.clear()
+
+    def judge(self) -> None:
+        """Compare the types that are wanted with those that are published.
+
+        Where nothing of a topic can be delivered, it is subscribed to with the type that is wanted: its publishers
+        then refuse the connection as they refuse any node's, so that no message is sent in vain, and ``rmpa why`` and
+        the diagnostics name the mismatch.
+        """
+        if not self.is_there:
             return
-        payload = there.numbers.stamp(payload)
-        message = ReceivedMessage(there.topic, there.type, memoryview(payload), self._now_ns())
-        if there.latch:
-            there.latched = message
-        if there.early is not None or there.registration.value is None:
-            self._wait(there, payload)  # also while the node is made anew: the newest messages wait for it
+        topic = self._topics.graph.topics.get(self.name)
+        types = topic.types if topic is not None and topic.publishers else ()
+        wanted = {each.type for each in self.users}
+        for each in [*self.users] if types else ():
+            if each.type is not None and each.type not in types and types[0] not in each.told:
+                each.told.add(types[0])
+                each.differs(types[0])
+        unfit = types and len(wanted) == 1 and not wanted & {None, *types}
+        kind = self._topics.types.at_hand(next(iter(wanted)) or "") if unfit else None
+        if kind is not self._kind:
+            self._kind = kind
+            self.registration.end()
+            self.registration = self._registered()
+
+    def _take(self, data: memoryview, header: Mapping[str, str]) -> None:
+        if not self.is_there:
+            return  # it has ended, and is being withdrawn
+        topics = self._topics
+        stamp_ns = time.time_ns()
+        source, type_ = header.get("callerid", "?"), header.get("type", "")
+        if self._headers.get(source) is not header:
+            self._headers[source] = header
+            if len(self._headers) > limits.SEEN_PUBLISHERS_MAX:
+                del self._headers[next(iter(self._headers))]
+            topics.types.learn(header)
+            if type_:
+                topics.graph.saw_type(self.name, type_)
+        payload = topics.buffers.copy(data)
+        message = ReceivedMessage(self.name, type_, payload, stamp_ns, source, header.get("md5sum", ""))
+        self.deliver(message, header if header.get("latching") == "1" else None)
+
+    def deliver(self, message: ReceivedMessage, latching: Mapping[str, str] | None) -> None:
+        """Hand a message to all; ``latching`` is its publisher's header, if that latches."""
+        if latching is None:
+            _hand(message, self.users)
+            return
+        latched = self._topics.latched.get((self.name, message.source))
+        again = latched is not None and latched.header is not latching and latched.message.payload == message.payload
+        if latched is not None and again and message.source != OWN:
+            # The publisher sends its latched message at each new connection: most have had it.
+            latched.header = latching
         else:
-            there.registration.value.publish_raw(payload)
-        self._subscriptions.publish_own(message, latch=there.latch)
+            latched = self._topics.keep(_Latched(message, latching))
+        _hand_latched(latched, self.users)
 
-    def _wait(self, there: _Publisher, payload: Payload) -> None:
-        if there.early is None:
-            there.early, there.early_bytes = deque(), 0
-        there.early.append((asyncio.get_running_loop().time(), payload))
-        there.early_bytes += len(payload)
-        while len(there.early) > 100 or (len(there.early) > 1 and there.early_bytes > 4 * MIB):
-            there.early_bytes -= len(there.early.popleft()[1])
+    def replay(self, subscription: ClientSubscription) -> None:
+        """Hand what is latched to a new subscription."""
+        subscriber = self.registration.value
+        connected = {OWN} | (subscriber.callers if subscriber is not None else set())
+        if subscription in self.users:
+            for (topic, source), latched in [*self._topics.latched.items()]:
+                if topic == self.name and source in connected:
+                    _hand_latched(latched, (subscription,))
 
-    def _begin(self, topic: str, type_: str, users: set[ClientPublication], *, latch: bool) -> _Publisher:
-        if len(self._topics) >= limits.PUBLISHERS_MAX:
-            unused = next((each for each in self._topics.values() if not each.users), None)
-            if unused is None:
-                problem = f"its clients publish {len(self._topics)} topics, which is the limit"
-                raise PeerRefused("the web server", problem, "publish fewer topics")
-            self._end(unused)
-        kind = self._types.at_hand(type_)
-        numbers = HeaderNumbers(kind) if kind is not None else None
-        there = self._topics[topic] = _Publisher(topic, type_, latch, users, numbers)
-        register = functools.partial(self._register, there)
-        refused = functools.partial(self._refused, there)
-        there.registration = Registration(self._link, "publisher", topic, register, refused)
-        return there
 
-    async def _register(self, there: _Publisher, node: Node) -> Publisher:
-        kind = await self._types.find_message(there.type)
-        if there.numbers is None and self._topics.get(there.topic) is there:
-            there.numbers = HeaderNumbers(kind)
-            waiting, there.early, there.early_bytes = there.early or (), deque(), 0
+def _hand_latched(latched: _Latched, subscriptions: Iterable[ClientSubscription]) -> None:
+    news = [each for each in subscriptions if each not in latched.had]
+    latched.had.update(each for each in news if each.type in (None, latched.message.type))
+    _hand(latched.message, news)
+
+
+def _hand(message: ReceivedMessage, subscriptions: Iterable[ClientSubscription]) -> None:
+    for each in [*subscriptions]:
+        if each.type in (None, message.type):
+            # A fault of one client must not cost the others their messages.
+            with logged_failure(_log, "a message of %s could not be delivered", message.topic):
+                each.receive(message)
+
+
+class _Publisher(_Shared[ClientPublication]):
+    """A topic that clients publish."""
+
+    # More than 12 fields: what is published before its type is known, or its subscribers are connected, waits.
+    def __init__(self, topics: HubTopics, name: str, type_: str, *, latch: bool) -> None:
+        super().__init__(topics.published, name)
+        self.type = type_
+        self.latch = latch
+        # The last message, if it latches.
+        self.latched: ReceivedMessage | None = None
+        self._topics = topics
+        # What was published before subscribers were connected; ``None`` from then on.
+        self._early: deque[tuple[float, Payload]] | None = deque()
+        self._early_bytes = 0
+        # Numbers its messages; ``None`` while its type is not known.
+        kind = topics.types.at_hand(type_)
+        self._numbers = HeaderNumbers(kind) if kind is not None else None
+        self.registration: Registration[Publisher] = Registration(
+            topics.link, "publisher", name, self._register, self.refused
+        )
+
+    def end(self) -> None:
+        """End it, and forget what is latched."""
+        super().end()
+        self._topics.latched.pop((self.name, OWN), None)
+
+    def publish(self, payload: Payload) -> None:
+        """Publish a message, also to clients of the hub: the node itself does not subscribe to it."""
+        if self._numbers is None:
+            self._wait(payload)  # it is numbered and delivered when the type is known
+            return
+        payload = self._numbers.stamp(payload)
+        message = ReceivedMessage(self.name, self.type, memoryview(payload), time.time_ns())
+        if self.latch:
+            self.latched = message
+        if self._early is not None or self.registration.value is None:
+            self._wait(payload)  # also while the node is made anew: the newest messages wait for it
+        else:
+            self.registration.value.publish_raw(payload)
+        if (there := self._topics.subscribed.get(self.name)) is not None:
+            there.deliver(message, {} if self.latch else None)
+
+    def _wait(self, payload: Payload) -> None:
+        if self._early is None:
+            self._early, self._early_bytes = deque(), 0
+        self._early.append((asyncio.get_running_loop().time(), payload))
+        self._early_bytes += len(payload)
+        while len(self._early) > 100 or (len(self._early) > 1 and self._early_bytes > 4 * MIB):
+            self._early_bytes -= len(self._early.popleft()[1])
+
+    async def _register(self, node: Node) -> Publisher:
+        kind = await self._topics.types.find_message(self.type)
+        if self._numbers is None and self.is_there:
+            self._numbers = HeaderNumbers(kind)
+            waiting, self._early, self._early_bytes = self._early or (), deque(), 0
             for _, payload in waiting:
-                self._publish(there, payload)
-        publisher = await node.advertise(there.topic, kind, latch=there.latch)
-        if there.early is not None and not there.latch:
+                self.publish(payload)
+        publisher = await node.advertise(self.name, kind, latch=self.latch)
+        if self._early is not None and not self.latch:
             # The master has just told the subscribers, which connect now: what is published meanwhile waits for them.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):
                     await publisher.wait_for_subscriber()
-        early, there.early = there.early, None
+        early, self._early = self._early, None
         oldest = asyncio.get_running_loop().time() - limits.EARLY_AGE
         young = [payload for came, payload in early or () if came >= oldest]  # an old command must not act late
         for payload in young:
             publisher.publish_raw(payload)
-        if not young and there.latched is not None:
+        if not young and self.latched is not None:
             # A new node: its subscribers have had it, newcomers have not.
-            publisher.publish_raw(there.latched.payload)
+            publisher.publish_raw(self.latched.payload)
         return publisher
-
-    def _refused(self, there: _Publisher, error: RmpaError) -> None:
-        if self._topics.get(there.topic) is there:
-            users = [*there.users]
-            there.users.clear()
-            self._end(there)
-            for each in users:
-                each.failed(error)
-
-    def _end(self, there: _Publisher) -> None:
-        if there.linger is not None:
-            there.linger.cancel()
-        del self._topics[there.topic]
-        self._subscriptions.forget_own(there.topic)
-        there.registration.end()

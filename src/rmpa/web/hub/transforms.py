@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.codec import codec_for
 from rmpa.web import limits
 from rmpa.web.hub.node_link import Follower
 
@@ -103,9 +102,7 @@ class TransformTree:
             self._places.clear()
             for topic in TOPICS:
                 self._subscriptions.append(self._topics.subscribe(topic, None, self.take, self._failed))
-        follower = Follower(self._followers)
-        self._followers[follower] = failed
-        return follower
+        return Follower(self._followers, failed)
 
     def rest(self) -> None:
         """Unsubscribe where no follower is left."""
@@ -115,8 +112,7 @@ class TransformTree:
     def take(self, message: ReceivedMessage) -> None:
         """A tf2_msgs/TFMessage, or what has the same bytes; what is broken in it is left out, as tf2 does."""
         try:
-            codec = codec_for(self._types.version(message.type, message.md5sum))
-            rows = codec.json_values(message.payload)["transforms"]
+            rows = self._types.codec(message).json_values(message.payload)["transforms"]
         except (RmpaError, KeyError):
             return  # a message of another type
         for row in rows:

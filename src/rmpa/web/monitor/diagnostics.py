@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
     from rmpa.web.monitor.messages import Tree, Value
-    from rmpa.web.monitor.resources import MessageValues
 
 # Between the parts of a status' key; a name that has it is mistaken only for another one of its own module.
 _BETWEEN: Final = "\x1f"
@@ -39,13 +38,11 @@ class DiagnosticsFeed:
 
     Args:
         hub: Subscribes.
-        values: Decodes.
         changed: Called when pages are to be shown something new.
     """
 
-    def __init__(self, hub: Hub, values: MessageValues, changed: Callable[[], None]) -> None:
+    def __init__(self, hub: Hub, changed: Callable[[], None]) -> None:
         self._hub = hub
-        self._values = values
         self._changed = changed
         self._table = StatusTable(limits.DIAGNOSTIC_HISTORY)
         self._subscription: ClientSubscription | None = None
@@ -58,12 +55,10 @@ class DiagnosticsFeed:
         # What each page is shown: statuses counted by level, and those that are wrong, without the agent's own.
         self.summary: Tree = {}
 
-    def follow(self, *, wanted: bool) -> None:
-        """Whether a page is open."""
-        if wanted and self._timer is None:
+    def follow(self) -> None:
+        """A page is open."""
+        if self._timer is None:
             self._look()
-        elif not wanted:
-            self.close()
 
     def close(self) -> None:
         """End; what was said is kept for the next page."""
@@ -123,7 +118,7 @@ class DiagnosticsFeed:
         if not self._table.admits(message.source, len(message.payload), now):
             return
         try:
-            statuses = self._values.of(message)["status"]
+            statuses = self._hub.values(message)["status"]
         except RmpaError:
             return  # not an array of statuses; its subscriber says so in the log
         self._table.take(message.source, statuses, now)

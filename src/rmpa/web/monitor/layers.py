@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 import struct
-import zlib
 from array import array
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,6 +18,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import WatchState, scan
 from rmpa.web.monitor.state import shown_node
+from rmpa.web.pictures import png_chunk, png_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -191,18 +191,10 @@ def _rows(data: memoryview, width: int, height: int, every: int) -> Iterable[byt
 
 def _png(width: int, height: int, rows: Iterable[bytes]) -> bytes:
     """A PNG of levels, whose palette is black of some opacity: the page gives it the colour of its text."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
     opacity = bytearray(256)
     for level, shade in enumerate(_OPACITY):
         opacity[(1 << level) - 1] = shade
-    packed = zlib.compressobj(1)
-    data = b"".join([*(packed.compress(b"\0" + row) for row in rows), packed.flush()])
-    head = struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)
-    palette = chunk(b"PLTE", bytes(768)) + chunk(b"tRNS", bytes(opacity))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + palette + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return png_file(width, height, 3, rows, png_chunk(b"PLTE", bytes(768)) + png_chunk(b"tRNS", bytes(opacity)))
 
 
 # What each type is on a map, and how it is made of its values.
@@ -224,7 +216,6 @@ class LayerWatch(WatchState):
 
     def __init__(self, id_: int, rate: float, decode: Decode) -> None:
         super().__init__(id_, "map", (), rate, decode)
-        self._last = -1e9
         self._waiting: dict[str, ReceivedMessage] = {}
         # Messages of each node that was heard.
         self._sources: dict[str, int] = {}
@@ -236,11 +227,9 @@ class LayerWatch(WatchState):
             self._waiting[message.source] = message
             self.beat.receive(message.stamp_ns * 1e-9, len(message.payload))
 
-    def due(self, now: float) -> float | None:
-        """When the next frame may be sent; ``None`` while there is nothing to send."""
-        if self.busy or not self._waiting:
-            return None
-        return max(now, self._last + 1 / (self._rate * len(self._sources)))
+    def waits(self) -> bool:
+        """Whether there is something to send, and no frame is being made."""
+        return bool(self._waiting) and not self.busy
 
     def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The frame that is due; of a large message the function that makes it, to be called in a thread.
@@ -248,7 +237,7 @@ class LayerWatch(WatchState):
         Raises:
             RmpaError: The message cannot be drawn.
         """
-        self._last = now
+        self._next = now + 1 / (self._rate * len(self._sources))
         message = self._waiting.pop(next(iter(self._waiting)))
         number = self._sources[message.source]
         make = functools.partial(layer_frame, self._id, message, self._decode(message), number)
@@ -260,7 +249,6 @@ class FramesWatch(WatchState):
 
     def __init__(self, id_: int, rate: float, decode: Decode) -> None:
         super().__init__(id_, "tf", (), rate, decode)
-        self._last = -1e9
         self._counts: dict[tuple[str, str], int] = {}
         self._changed: dict[tuple[str, str], list[Any]] = {}
         self._left_out = 0
@@ -292,13 +280,13 @@ class FramesWatch(WatchState):
         except (KeyError, TypeError, AttributeError):
             raise RemoteProtocolError(f"{message.type} has no transforms as a tf2_msgs/TFMessage has") from None
 
-    def due(self, now: float) -> float | None:
-        """When the next frame may be sent; ``None`` while there is nothing to send."""
-        return max(now, self._last + 1 / self._rate) if self._changed else None
+    def waits(self) -> bool:
+        """Whether there is something to send."""
+        return bool(self._changed)
 
     def frame(self, now: float) -> dict[str, Any]:
         """What changed: lists of child, parent, sender, static, stamp, receipt, count of messages, pose or null."""
-        self._last = now
+        self._next = now + 1 / self._rate
         changed, self._changed = self._changed, {}
         return {"op": "tf", "id": self._id, "frames": [*changed.values()], "left_out": self._left_out}
 

@@ -7,26 +7,23 @@ whole. Of live messages values are cut to a size, numbers found by a path, scans
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import struct
 import time
-from array import array
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.web.monitor import limits
+from rmpa.web.pictures import Picture, compressed_picture, raw_picture
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.web.hub.node_link import Payload
-    from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
 
     Decode = Callable[[ReceivedMessage], Any]  # the values of a message, decoded at most once for all clients
 
@@ -78,9 +75,6 @@ IMAGE_HEADER: Final = struct.Struct("<BBHHHIQHH")
 IMAGE: Final = 1
 # Formats of an image's bytes; rgb8, bgr8 and mono8 are rows of pixels without padding.
 FORMATS: Final = {"jpeg": 1, "png": 2, "rgb8": 3, "mono8": 4, "bgr8": 5}
-_CHANNELS: Final = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC1": 1, "8UC3": 3}
-# Encodings of one channel, with the letter and bytes of its values; little-endian, as ROS machines are.
-_DEPTHS: Final = {"16UC1": ("H", 2), "mono16": ("H", 2), "32FC1": ("f", 4)}
 # The largest integer that a browser's numbers hold exactly; a larger one is sent as text.
 _EXACT: Final = 2**53
 _INDEX: Final = re.compile(r"\[(\d+)\]")
@@ -172,94 +166,11 @@ def _range(value: Any, low: float, high: float) -> float | None:
     return round(float(value), 3) if value is not None and low <= value <= high else None
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An image for a browser: its size in pixels, the format of ``data``, and the size of the image it was made of.
-
-    All sizes are 0 for a compressed one, which says them itself.
-    """
-
-    format: str
-    width: int
-    height: int
-    data: Payload
-    whole: tuple[int, int] = (0, 0)
-
-    def frame(self, watch: int, stamp_ns: int) -> bytes:
-        """The binary frame."""
-        size = self.width, self.height
-        whole = (min(each, 0xFFFF) for each in self.whole)
-        return IMAGE_HEADER.pack(IMAGE, FORMATS[self.format], *size, 0, watch, stamp_ns, *whole) + self.data
-
-
-def compressed_picture(format_: str, data: Payload) -> Picture:
-    """Of a sensor_msgs/CompressedImage. The bytes say what they are; ``format`` is free text in ROS 1.
-
-    Raises:
-        RemoteProtocolError: It is neither JPEG nor PNG.
-    """
-    start = bytes(data[:8])
-    if start.startswith(b"\xff\xd8\xff"):
-        return Picture("jpeg", 0, 0, data)
-    if start == b"\x89PNG\r\n\x1a\n":
-        return Picture("png", 0, 0, data)
-    raise RemoteProtocolError(f"an image of the format {format_[:40]!a} is neither JPEG nor PNG")
-
-
-def raw_picture(width: int, height: int, encoding: str, step: int, data: Payload, place: int = 0) -> Picture:
-    """Of a sensor_msgs/Image; of one that is larger than its place every n-th row and column.
-
-    Args:
-        width: Pixels.
-        height: Pixels.
-        encoding: Of ROS (``sensor_msgs/image_encodings.h``).
-        step: Bytes of a row.
-        data: The rows.
-        place: The device's pixels that the page has for the width; 0: not known.
-
-    Raises:
-        RemoteProtocolError: The encoding cannot be shown, or the sizes do not fit together.
-    """
-    letter, size = _DEPTHS.get(encoding, ("", _CHANNELS.get(encoding, 0)))
-    if not size:
-        shown = ", ".join((*_CHANNELS, *_DEPTHS))
-        raise RemoteProtocolError(f"images of the encoding {encoding[:40]!a} are not shown; these are: {shown}")
-    if width <= 0 or height <= 0 or step < width * size or len(data) < step * (height - 1) + width * size:
-        raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
-    every = _every(width, height, place, limits.DEPTH_PIXELS if letter else limits.IMAGE_PIXELS)
-    source, columns, rows, whole = memoryview(data).cast("B"), width // every, height // every, (width, height)
-    row = columns * every * size  # bytes of a row that are used
-    starts = range(every // 2 * step, step * height, every * step)[:rows]
-    if letter:
-        lines = [array(letter, bytes(source[at : at + row]))[every // 2 :: every] for at in starts]
-        return Picture("mono8", columns, rows, _shades(lines), whole)
-    used: Payload = (
-        source[: row * rows] if row == step and every == 1 else b"".join(source[a : a + row] for a in starts)
-    )
-    if size == 1:
-        return Picture("mono8", columns, rows, used[every // 2 :: every] if every > 1 else used, whole)
-    name = "bgr8" if encoding.startswith("bgr") else "rgb8"
-    if size == 3 and every == 1:
-        return Picture(name, columns, rows, used, whole)
-    out = bytearray(columns * rows * 3)
-    for channel in range(3):
-        out[channel::3] = used[every // 2 * size + channel :: size * every]
-    return Picture(name, columns, rows, bytes(out), whole)
-
-
-def _every(width: int, height: int, place: int, most: int) -> int:
-    """Of how many rows and columns one is shown: the width is at most a quarter more than its place."""
-    fits = math.ceil(width / (1.25 * place)) if place else 1
-    return min(max(1, fits, math.ceil(math.sqrt(width * height / most))), width, height)
-
-
-def _shades(lines: Iterable[Iterable[float]]) -> bytes:
-    """Of one channel of 16 or 32 bits, as depth cameras have it: from black for the least value to white."""
-    values = [*itertools.chain.from_iterable(lines)]
-    measured = [value for value in values if 0 < value < math.inf]  # 0 and NaN: nothing was measured
-    least, most = (min(measured), max(measured)) if measured else (0.0, 1.0)
-    scale = 254 / (most - least) if most > least else 254.0
-    return bytes(1 + int((value - least) * scale) if 0 < value < math.inf else 0 for value in values)
+def image_frame(picture: Picture, watch: int, stamp_ns: int) -> bytes:
+    """The binary frame of an image."""
+    size = picture.width, picture.height
+    whole = (min(each, 0xFFFF) for each in picture.whole)
+    return IMAGE_HEADER.pack(IMAGE, FORMATS[picture.format], *size, 0, watch, stamp_ns, *whole) + picture.data
 
 
 # A moment in seconds since the epoch, and a value for each line; ``None`` where there is none.
@@ -387,6 +298,8 @@ class WatchState:
         self.beat = Beat()
         # Whether a frame is being made in a thread.
         self.busy = False
+        # ``None`` while there is none yet, or it was refused.
+        self.subscription: ClientSubscription | None = None
 
     def receive(self, message: ReceivedMessage) -> None:
         """Keep a message; a plot takes its numbers at once, all others decode only what is sent.
@@ -404,10 +317,14 @@ class WatchState:
         """The page has drawn an image."""
         self._unseen = max(0, self._unseen - 1)
 
+    def waits(self) -> bool:
+        """Whether there is something to send, and the page is not behind."""
+        waiting = len(self._samples) > 0 if self._paths else self._newest is not None
+        return waiting and self._unseen < limits.UNSEEN_MAX
+
     def due(self, now: float) -> float | None:
         """When the next frame may be sent; ``None`` while there is nothing to send, or the page is behind."""
-        waiting = len(self._samples) > 0 if self._paths else self._newest is not None
-        return max(now, self._next) if waiting and self._unseen < limits.UNSEEN_MAX else None
+        return max(now, self._next) if self.waits() else None
 
     def frame(self, now: float) -> bytes | dict[str, Any] | Callable[[], bytes]:
         """The picture or message that is due.
@@ -423,7 +340,7 @@ class WatchState:
         about = {"id": self._id, "stamp": message.stamp_ns / 1e9, "type": message.type}
         if self._how == "image":
             self._unseen += self._place > 0
-            frame = _picture(message, values, self._place).frame(self._id, message.stamp_ns)
+            frame = image_frame(_picture(message, values, self._place), self._id, message.stamp_ns)
             # However large it is, pictures take a bounded share of the processor.
             self._next = now + max(1 / self._rate, (time.thread_time() - began) * limits.PICTURE_SHARE)
             return frame

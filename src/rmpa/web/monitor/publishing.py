@@ -13,12 +13,10 @@ from rmpa.ros.types.values import CODES, Written, WrongValueError
 from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.clients.connection import Session
     from rmpa.web.hub.topics import ClientPublication
+    from rmpa.web.monitor.session import MonitorSession
 
 _WORDS: Final = ("nan", "inf", "+inf", "-inf")
 
@@ -84,23 +82,11 @@ class PagePublications:
     """The topics of one page.
 
     Args:
-        session: Publishes them.
-        send: Sends a message to the page.
-        failed: Tells the page why a publication has ended.
-        clock: Monotonic seconds, as ``now``.
+        session: Publishes them, and tells the page.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        send: Callable[[dict[str, Any]], None],
-        failed: Callable[[int, RmpaError], None],
-        clock: Callable[[], float],
-    ) -> None:
+    def __init__(self, session: MonitorSession) -> None:
         self._session = session
-        self._send = send
-        self._failed = failed
-        self._clock = clock
         # ``None`` while its type is looked for.
         self._repeated: dict[int, _Repeated | None] = {}
 
@@ -127,7 +113,7 @@ class PagePublications:
             except RmpaError as error:
                 self._ended(id_, error)
                 return
-            now = self._clock()
+            now = self._session.clock()
             each = _Repeated(made, codec, values, 1 / rate if rate else 0.0, now, now)
             self._publish(id_, each, now)
             if rate and id_ in self._repeated:
@@ -143,7 +129,7 @@ class PagePublications:
         """The page is there, and is told how many messages were published."""
         if (each := self._repeated.get(id_)) is not None:
             each.renewed = now
-            self._send({"op": "published", "id": id_, "n": each.count})
+            self._session.send({"op": "published", "id": id_, "n": each.count})
 
     def end(self, id_: int) -> None:
         """Publish it no more."""
@@ -175,8 +161,8 @@ class PagePublications:
         each.count += 1
         each.next = max(each.next + each.period, now)  # after a pause the missed ones are left out
         if each.count == 1:
-            self._send({"op": "published", "id": id_, "n": 1})
+            self._session.send({"op": "published", "id": id_, "n": 1})
 
     def _ended(self, id_: int, error: RmpaError) -> None:
         self.end(id_)
-        self._failed(id_, error)
+        self._session.failed(id_, error)

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import itertools
 import logging
-import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -27,7 +26,7 @@ from rmpa.observe.snapshot import ModuleFacts
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.descriptor import SERVICE_TYPE
 from rmpa.trust.permissions import InviteReply
-from rmpa.web.hub.params import value_at
+from rmpa.web.hub.params import as_json, value_at
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.descriptions import SUFFIX, Descriptions
 from rmpa.web.monitor.driving import TYPES
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import ParamValue
-    from rmpa.web.monitor.resources import ResourceWatch
+    from rmpa.web.monitor.monitor import Monitor
 
 _log = logging.getLogger(__name__)
 
@@ -79,28 +78,16 @@ class Answers:
 
     Args:
         hub: Calls services, and has this module's parameters.
-        resources: Knows the Smart Resources.
+        monitor: Knows the agent, the Smart Resources and the diagnostics.
         environ: Says where the agents' sockets are.
-        agent: Returns the agent's name; empty for the only one.
-        past: The past of the values of a status of ``/diagnostics``, by its key.
-        descriptions: The files that describe this module's resources.
+        folder: Where the files that describe this module's resources are; empty for none.
     """
 
-    def __init__(
-        self,
-        hub: Hub,
-        resources: ResourceWatch,
-        environ: Mapping[str, str],
-        agent: Callable[[], str],
-        past: Callable[[str], Any] = lambda _: {},
-        descriptions: Descriptions | None = None,
-    ) -> None:
+    def __init__(self, hub: Hub, monitor: Monitor, environ: Mapping[str, str], folder: str = "") -> None:
         self._hub = hub
-        self._past_of = past
-        self._resources = resources
+        self._monitor = monitor
         self._environ = environ
-        self._agent_name = agent
-        self._descriptions = descriptions or Descriptions()
+        self.descriptions = Descriptions(folder)
         # Each check starts a program: one at a time, and no save between the check and the end of another.
         self._checks = asyncio.Lock()
         self._threads = ThreadPoolExecutor(limits.ANSWERS_AT_ONCE, "rmpa-answers")
@@ -134,7 +121,7 @@ class Answers:
         return await self.ask_agent("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
     async def _past(self, args: Args) -> Any:
-        return self._past_of(_text(args, "status"))
+        return self._monitor.diagnostics.past(_text(args, "status"))
 
     async def _graph(self, args: Args) -> Any:
         """The graph of this module's core: each topic with its type and its nodes, proxies included, and services.
@@ -171,15 +158,18 @@ class Answers:
         known = ("modules", "after", "level", "node", "since", "most")
         found = await self.ask_agent("log", **{key: args[key] for key in known if key in args})
         for module in found:
-            lines = module.get("lines", ())
-            nodes = {line["node"] for line in lines}
-            hidden = {node: why for node in nodes if (why := self._denied(Access.LOG, node))}
-            module["lines"] = [line for line in lines if line["node"] not in hidden]
+            self._hide(module, "lines", Access.LOG, lambda line: line["node"])
             for line in module["lines"]:
                 line["text"] = cut_text(line["text"], limits.LOG_CHARACTERS)
-            if hidden and not module["lines"]:
-                module["problem"] = next(iter(hidden.values()))
         return found
+
+    def _hide(self, module: Args, what: str, access: Access, name_of: Callable[[Args], str]) -> None:
+        """Leave out what the rules let no page see of a module; where nothing is left, its ``problem`` says why."""
+        told = [(name_of(each), each) for each in module.get(what, ())]
+        denied = {name: why for name in dict(told) if (why := self._denied(access, name))}
+        module[what] = [each for name, each in told if name not in denied]
+        if denied and not module[what]:
+            module["problem"] = next(iter(denied.values()))
 
     def _denied(self, access: Access, name: str) -> str:
         """Why a page may not do that with what has this name; empty: it may."""
@@ -200,10 +190,7 @@ class Answers:
         """The resources that each module can start, with their processes; those that the rules let a page start."""
         found = await self.ask_agent("launch", what="list")
         for module in found:
-            judged = [(each, self._denied(Access.LAUNCH, f"/{each['name']}")) for each in module["resources"]]
-            module["resources"] = [each for each, why in judged if not why]
-            if judged and not module["resources"]:
-                module["problem"] = judged[0][1]
+            self._hide(module, "resources", Access.LAUNCH, lambda each: f"/{each['name']}")
         return found
 
     async def _top(self, _args: Args) -> Any:
@@ -238,7 +225,7 @@ class Answers:
     async def _keep_recording(self, args: Args) -> Any:
         """Keep what the rings of all modules have; why each that cannot does not."""
         why = _text(args, "why")[: limits.LOG_CHARACTERS]
-        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._agent_name(), time.time_ns())}")
+        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._monitor.agent, time.time_ns())}")
         return await self.ask_agent("record", what="keep", why=why)
 
     async def _remove_recording(self, args: Args) -> Any:
@@ -255,13 +242,13 @@ class Answers:
             return await asyncio.get_running_loop().run_in_executor(self._threads, call)
 
     async def _description(self, args: Args) -> Any:
-        return await self._of_file(args, self._descriptions.read)
+        return await self._of_file(args, self.descriptions.read)
 
     async def _check_description(self, args: Args) -> Any:
-        return {"problems": await self._of_file(args, self._descriptions.check, "text")}
+        return {"problems": await self._of_file(args, self.descriptions.check, "text")}
 
     async def _save_description(self, args: Args) -> Any:
-        return await self._of_file(args, self._descriptions.save, "text", "digest")
+        return await self._of_file(args, self.descriptions.save, "text", "digest")
 
     async def ask_agent(self, op: str, **args: object) -> Any:
         """Call an operation of the agent."""
@@ -272,7 +259,7 @@ class Answers:
 
     async def _in_thread(self, do: Callable[[ControlClient], Any]) -> Any:
         def ask() -> Any:
-            agent = choose_agent(self._environ, self._agent_name() or None)
+            agent = choose_agent(self._environ, self._monitor.agent or None)
             with ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
                 return do(client)
 
@@ -317,7 +304,9 @@ class Answers:
         """
         peer = _text(args, "peer")
         tree = await self._of_peer(peer, lambda params: params.get("/")) if peer else await self._own_params()
-        return _if_new(args, values=self._hub.link.rules.visible_tree(_plain(tree)))
+        return _if_new(
+            args, values=self._hub.link.rules.visible_tree(as_json(tree, lambda data: f"{len(data)} bytes"))
+        )
 
     async def _own_params(self) -> Mapping[str, ParamValue]:
         self._hub.link.need()
@@ -326,7 +315,7 @@ class Answers:
 
     async def _param_names(self, _args: Args) -> Any:
         await self._own_params()
-        names = islice(self._hub.params.values((), "/"), 5000)
+        names = islice(self._hub.params.values(), 5000)
         return {"names": sorted(self._hub.link.rules.visible(dict.fromkeys(names)))}
 
     async def _set_param(self, args: Args) -> Any:
@@ -393,7 +382,7 @@ class Answers:
 
     async def _configure(self, args: Args) -> Any:
         resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
-        facts = self._resources.facts.get(node_key(_text(args, "peer"), resource))
+        facts = self._monitor.resources.facts.get(node_key(_text(args, "peer"), resource))
         known = facts.descriptor.get("parameters", ()) if facts is not None else ()
         kind = next((each["type"] for each in known if each.get("name") == name), None)
         if kind not in _LISTS:
@@ -505,16 +494,3 @@ def _name(args: Args, key: str) -> str:
     if value != "/" and not is_global_name(value):
         raise ConfigError(key, f"{value[:80]!r} is not a name", "write it as /name")
     return value
-
-
-def _plain(value: object) -> Any:
-    """Parameters for JSON: bytes are shown by their number, dates as they are written."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, bytes | bytearray | memoryview):
-        return f"{len(value)} bytes"
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -12,8 +12,6 @@ import msgspec
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
-from rmpa.core.limits import KIB, MIB
-from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, LEVEL_FOR, TOPIC, Descriptor
 from rmpa.web.monitor import limits
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import Follower, Payload
+    from rmpa.web.hub.node_link import Follower
     from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
 
 
@@ -136,40 +134,6 @@ def resource_flows(facts: Sequence[ResourceFacts], own: str) -> dict[str, Tree]:
     return {key: flow for key, flow in found.items() if own not in key.split(">")}
 
 
-# Bytes of the messages whose values are kept for further pages; values take some ten times as much.
-_KEPT: Final = 4 * MIB
-# Bytes that an entry counts beside its payload, so that small messages do not gather.
-_OVERHEAD: Final = 64 * KIB
-
-
-class MessageValues:
-    """Decodes messages of the hub, once for all pages: these get a topic's message at nearly the same time.
-
-    Args:
-        hub: Knows the types.
-    """
-
-    def __init__(self, hub: Hub) -> None:
-        self._hub = hub
-        self._last: dict[int, tuple[Payload, Any]] = {}
-
-    def of(self, message: ReceivedMessage) -> Any:
-        """The values of a message; they are shared, and must not be changed.
-
-        Raises:
-            RmpaError: Its type is not known, or its bytes are not a message of that type.
-        """
-        last, key = self._last, id(message.payload)
-        known = last.pop(key, None)
-        if known is None or known[0] is not message.payload:  # an object's id is used again once it has gone
-            codec = codec_for(self._hub.types.version(message.type, message.md5sum))
-            known = message.payload, codec.views(message.payload)  # a map of 16 million cells is no list
-        last[key] = known
-        while sum(len(payload) + _OVERHEAD for payload, _ in last.values()) > _KEPT:
-            del last[next(iter(last))]
-        return known[1]
-
-
 _TEXT: Final = "std_msgs/String"
 # When a topic of a resource is followed: always, while pages are open, while a page shows the resource.
 _ALWAYS, _SHOWN, _LOOKED_AT = range(3)
@@ -213,12 +177,10 @@ class ResourceWatch:
 
     Args:
         hub: Subscribes to their topics.
-        values: Decodes their messages.
     """
 
-    def __init__(self, hub: Hub, values: MessageValues) -> None:
+    def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self.values = values
         self._follower: Follower | None = None
         self._paths: dict[str, _Path] = {}
         self._wanted = False
@@ -309,7 +271,7 @@ class ResourceWatch:
         peer = proxied_peer(message.source)
         before = path.heard.get(peer) or ResourceFacts(name=path.name, peer=peer)
         try:
-            values = self.values.of(message)  # latched ones may come before the descriptor
+            values = self._hub.values(message)  # latched ones may come before the descriptor
             said = _described(values["data"]) if topic == TOPIC else _said(before, topic, values)
         except (RmpaError, msgspec.DecodeError, KeyError, TypeError, RecursionError):
             return  # another program's topic of that name

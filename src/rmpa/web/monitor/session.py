@@ -16,8 +16,8 @@ from msgspec import Meta
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.timers import TokenBucket
-from rmpa.web.clients.connection import Session, decoder_of, ops_of
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.connection import Session, decoder_of, ops_of
+from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.driving import TWIST, Command, Driver, Joystick, type_driven
 from rmpa.web.monitor.layers import watch_of
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
-    from rmpa.web.hub.topics import ClientSubscription, ReceivedMessage
+    from rmpa.web.hub.topics import ReceivedMessage
+    from rmpa.web.monitor.driving import Stick
     from rmpa.web.monitor.monitor import Monitor
-    from rmpa.web.monitor.sticks import Stick
 
 _log = logging.getLogger(__name__)
 Id: TypeAlias = Annotated[int, Meta(gt=0, lt=2**32)]
@@ -111,7 +111,6 @@ class MonitorSession(Session):
     Args:
         hub: The hub.
         rights: What the page may do.
-        priority: The priority of a topic's messages.
         address: The page's, for logs.
         monitor: What all pages share.
         clock: Monotonic seconds; the event loop's unless it is given.
@@ -125,40 +124,38 @@ class MonitorSession(Session):
         self,
         hub: Hub,
         rights: Rights,
-        priority: Callable[[str], int],
         address: str,
         monitor: Monitor,
         clock: Callable[[], float] | None = None,
     ) -> None:
         # The joystick publishes by the hub; each op checks the page's own right.
-        super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), priority, address)
+        super().__init__(hub, dataclasses.replace(rights, control=rights.control or rights.drive), address)
         self._may = rights
         self._monitor = monitor
-        self._clock = clock or asyncio.get_running_loop().time
-        self._opened = self._looked = self._clock()
+        self.clock = clock or asyncio.get_running_loop().time
+        self._opened = self._looked = self.clock()
         self._tick = self._opened + limits.TICK_PERIOD
         self._bucket = TokenBucket(limits.REQUEST_RATE, limits.REQUEST_BURST)
         self._patches = StatePatches(self._opened)
-        self._watches: dict[int, tuple[WatchState, ClientSubscription | None]] = {}
+        self._watches: dict[int, WatchState] = {}
         self._questions: set[int] = set()
         self._joystick = Joystick()
         self._driver: Driver | None = None
         self._stick: Stick | None = None
-        self._has_stick = False
-        self._publications = PagePublications(self, self._send, self._failed, self._clock)
+        self._publications = PagePublications(self)
 
     def opened(self) -> None:
         """Greet the page, and show it the state."""
         fastest = {"linear": limits.DRIVE_SPEED, "angular": limits.DRIVE_TURN, "steer": limits.DRIVE_STEER}
         fastest["acceleration"] = limits.DRIVE_ACCELERATION
         may = [right for right in RIGHTS if getattr(self._may, right)]
-        about = {"agent": self._monitor.mesh.agent, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
-        self._send({"op": "hello", "version": VERSION, "at": self._opened, **about})
-        self._monitor.mesh.follow(self, self._update)
+        about = {"agent": self._monitor.module, "period": limits.PATCH_PERIOD, "fastest": fastest, "may": may}
+        self.send({"op": "hello", "version": VERSION, "at": self._opened, **about})
+        self._monitor.follow(self, self._update)
 
     def closing(self) -> None:
         """Stop the robot, and all that the page had open."""
-        self._monitor.mesh.unfollow(self)
+        self._monitor.unfollow(self)
         self._stop()
         self._show_stick("")
         self._publications.close()
@@ -181,7 +178,7 @@ class MonitorSession(Session):
             try:
                 getattr(self, type(message).__name__)(now, **fields)
             except RmpaError as error:
-                self._failed(fields.get("id", 0), error)
+                self.failed(fields.get("id", 0), error)
             self.handle_timer(now)
 
     def _malformed(self, text: str, refusal: str = "message") -> None:
@@ -192,11 +189,13 @@ class MonitorSession(Session):
 
     def next_timer(self) -> float | None:
         """When something is due that the page waits for, or the robot must be stopped."""
-        dues: list[float | None] = [self._tick, self._joystick.due, self._patches.due, self._publications.due]
+        dues: list[float | None] = [self._tick, self._patches.due, self._publications.due]
+        if self._driver is not None:
+            dues.append(self._driver.due)
         if self._stick is not None and (wait := self._stick.due(self)) is not None:
-            dues.append(self._clock() + wait)
+            dues.append(self.clock() + wait)
         if self.connection.unsent == 0:
-            dues += [watch.due(0.0) for watch, _ in self._watches.values()]
+            dues += [watch.due(0.0) for watch in self._watches.values()]
         elif self._watches:
             dues.append(self._looked + limits.UNSENT_RETRY)
         return min(due for due in dues if due is not None)
@@ -204,20 +203,20 @@ class MonitorSession(Session):
     def handle_timer(self, now: float) -> None:
         """Send what is due, and stop a robot that no page commands any more."""
         self._looked = now
-        if self._joystick.due is not None and now >= self._joystick.due:
+        if self._driver is not None and self._driver.due is not None and now >= self._driver.due:
             self._stop()
         with self._turn():
             if self._stick is not None:
                 self._stick.handle_timer(self)
             self._publications.handle_timer(now)
-            if (news := self._patches.take(now, self._monitor.mesh.details)) is not None:
-                self._send(news)
+            if (news := self._patches.take(now, self._monitor.details)) is not None:
+                self.send(news)
             self._flush(now)
             if now >= self._tick:
                 self._tick = now + limits.TICK_PERIOD
                 if self.connection.unsent == 0:
                     # Scripts do not see WebSocket's pings: a page that misses ticks takes the connection for lost.
-                    self._send({"op": "tick", "at": now})
+                    self.send({"op": "tick", "at": now})
 
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:
@@ -229,10 +228,11 @@ class MonitorSession(Session):
             self.connection.end(WSCloseCode.INTERNAL_ERROR, "the server failed; its log says why")
         self.connection.arm()
 
-    def _send(self, message: dict[str, Any]) -> None:
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a message to the page."""
         self.connection.push((Opcode.TEXT, (msgspec.json.encode(message),)))
 
-    def _failed(self, id_: int, error: RmpaError) -> None:
+    def failed(self, id_: int, error: RmpaError) -> None:
         """What the page ordered cannot be done: a watch, a question, or (0) neither."""
         remedy = str(getattr(error, "remedy", ""))
         text = str(error).removesuffix(f"; {remedy}") if remedy else str(error)
@@ -240,11 +240,11 @@ class MonitorSession(Session):
         self._refuse(id_, text, remedy, error.code, **field)
 
     def _refuse(self, id_: int, error: str, remedy: str = "", code: str = "refused", **more: Any) -> None:
-        self._send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
+        self.send({"op": "failed", "id": id_, "error": error, "remedy": remedy, "code": code, **more})
 
     def _update(self, state: Tree) -> None:
         self._patches.update(state)
-        self.handle_timer(self._clock())
+        self.handle_timer(self.clock())
 
     def op_ack(self, _: float, *, n: int) -> None:
         """The state or patch number ``n`` is shown, and all before it."""
@@ -276,8 +276,8 @@ class MonitorSession(Session):
             raise RemoteProtocolError(f"watch {id} is in use")
         if len(self._watches) >= limits.WATCHES_MAX:
             raise RemoteProtocolError(f"{limits.WATCHES_MAX} topics are watched already; close one first")
-        watch = watch_of(id, how, fields, rate, self._monitor.values.of, width)
-        self._watches[id] = watch, None
+        watch = watch_of(id, how, fields, rate, self.hub.values, width)
+        self._watches[id] = watch
 
         def receive(message: ReceivedMessage) -> None:
             with self._turn():
@@ -285,38 +285,36 @@ class MonitorSession(Session):
                     watch.receive(message)
                 except RmpaError as error:
                     self._end_watch(id, error)
-                self._flush(self._clock())
+                self._flush(self.clock())
 
         def failed(error: RmpaError) -> None:
             with self._turn():
                 self._end_watch(id, error)
 
         try:
-            subscription = self.subscribe(topic, None, receive, failed)
+            watch.subscription = self.subscribe(topic, None, receive, failed)
         except RmpaError as error:
             self._end_watch(id, error)
-        else:
-            self._watches[id] = watch, subscription
 
     def op_seen(self, _: float, *, ids: Annotated[tuple[Id, ...], Meta(max_length=limits.WATCHES_MAX)]) -> None:
         """An image of each of these watches is drawn."""
         for id_ in ids:
             if (known := self._watches.get(id_)) is not None:
-                known[0].seen()
+                known.seen()
 
     def op_unwatch(self, _: float, *, id: Id) -> None:  # noqa: A002
         """No more messages of that watch."""
         self._end_watch(id)
 
     def _end_watch(self, id_: int, error: RmpaError | None = None) -> None:
-        _, subscription = self._watches.pop(id_, (None, None))
-        if subscription is not None:
-            subscription.close()
+        watch = self._watches.pop(id_, None)
+        if watch is not None and watch.subscription is not None:
+            watch.subscription.close()
         if error is not None:
-            self._failed(id_, error)
+            self.failed(id_, error)
 
     def _flush(self, now: float) -> None:
-        for id_, (watch, _) in [*self._watches.items()] if self.connection.unsent == 0 else ():
+        for id_, watch in [*self._watches.items()] if self.connection.unsent == 0 else ():
             due = watch.due(now)
             if due is None or due > now:
                 continue
@@ -326,11 +324,11 @@ class MonitorSession(Session):
                 self._end_watch(id_, error)
             else:
                 if (beat := watch.beat.news()) is not None:
-                    self._send({"op": "beat", "id": id_, **beat})
+                    self.send({"op": "beat", "id": id_, **beat})
                 if isinstance(frame, bytes):
                     self.connection.push((Opcode.BINARY, (frame,)))
                 elif isinstance(frame, dict):
-                    self._send(frame)
+                    self.send(frame)
                 else:
                     self._make(id_, watch, frame)
 
@@ -340,7 +338,7 @@ class MonitorSession(Session):
 
         def done(frame: bytes) -> None:
             watch.busy = False
-            if self._watches.get(id_, (None,))[0] is watch:
+            if self._watches.get(id_) is watch:
                 with self._turn():
                     self.connection.push((Opcode.BINARY, (frame,)))
 
@@ -365,8 +363,8 @@ class MonitorSession(Session):
                     self._questions.discard(id)
                     send(value)
 
-            done = functools.partial(reply, lambda value: self._send({"op": "answer", "id": id, "value": value}))
-            failed = functools.partial(reply, functools.partial(self._failed, id))
+            done = functools.partial(reply, lambda value: self.send({"op": "answer", "id": id, "value": value}))
+            failed = functools.partial(reply, functools.partial(self.failed, id))
             self.run(self._monitor.answers.answer(what, args), done, failed)
 
     def _is_late(self, id_: int, now: float, at: float) -> bool:
@@ -436,19 +434,18 @@ class MonitorSession(Session):
     def _show_stick(self, topic: str) -> None:
         stick = self._stick
         if stick is not None and stick.topic != topic:
-            self._monitor.sticks.hide(stick, self)
-            self._stick, self._has_stick = None, False
+            self._stick = None
+            stick.hide(self)
         if topic and self._stick is None:
             self._stick = self._monitor.sticks.show(topic, self, self._stick_changed, drives=self._may.drive)
             self._tell_stick(self._stick)
 
-    def _stick_changed(self) -> None:
+    def _stick_changed(self, had: bool) -> None:
         stick = self._stick
         if stick is None:
             return
-        had, self._has_stick = self._has_stick, stick.holder is self
         with self._turn():
-            if had and not self._has_stick:
+            if had and stick.holder is not self:
                 self._joystick.release()
                 self._stop()
                 if stick.hold.ended:
@@ -458,8 +455,8 @@ class MonitorSession(Session):
     def _tell_stick(self, stick: Stick) -> None:
         hold = stick.hold
         holder = {"by": hold.by, "module": hold.module, "since": hold.since} if hold.by else None
-        about = {"holder": holder, "mine": self._has_stick, "problem": stick.problem}
-        self._send({"op": "stick", "topic": stick.topic, **about})
+        about = {"holder": holder, "mine": stick.holder is self, "problem": stick.problem}
+        self.send({"op": "stick", "topic": stick.topic, **about})
 
     def op_drive(
         self,
@@ -493,7 +490,7 @@ class MonitorSession(Session):
                 late = f"commands reach the server {now - at:.1f} s late, and are dropped"
                 self._refuse(0, late, f"above {limits.DRIVE_TIMEOUT:g} s the robot stays where it is", hold=hold)
             return
-        if joystick.topic != topic:
+        if self._driver is not None and self._driver.topic != topic:
             self._stop()
         self._show_stick(topic)
         assert self._stick is not None  # noqa: S101 - shown just now
@@ -504,11 +501,8 @@ class MonitorSession(Session):
             raise
         if (driver := self._driver_of(topic, type)) is None:
             joystick.release(hold)
-        elif joystick.drive(topic, now):
-            sent = driver.command(Command(linear, side, angular, axes, buttons), ramp, now)
-            self._send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
-        else:
-            driver.arm(now)
+        elif (sent := driver.command(Command(linear, side, angular, axes, buttons), ramp, now)) is not None:
+            self.send({"op": "driven", "linear": sent.linear, "side": sent.side, "angular": sent.angular})
 
     def op_release(self, _: float, *, hold: int) -> None:
         """The joystick is let go: the robot is stopped at once, and nothing more of that hold drives it."""
@@ -516,8 +510,7 @@ class MonitorSession(Session):
         self._stop()
 
     def _stop(self) -> None:
-        topic, self._joystick.topic = self._joystick.topic, ""
-        if topic and self._driver is not None and self._driver.topic == topic:
+        if self._driver is not None and self._driver.due is not None:
             self._driver.stop()
 
     def _end_driver(self) -> None:
@@ -537,7 +530,7 @@ class MonitorSession(Session):
 
         def failed(error: RmpaError) -> None:
             self._end_driver()
-            self._failed(0, error)
+            self.failed(0, error)
 
         driver = self._driver
         try:

@@ -53,7 +53,6 @@ FRAGMENT_TIMEOUT: Final = 60.0
 # [Rosbridge] Bytes that a `png` unpacks to
 # At it: it is refused
 # Told in: status
-# Why: Its lines may have filters, which are undone in Python.
 PNG_MAX: Final = 4 * MIB
 # [Rosbridge] Subscribed topics
 # At it: further ones are refused
@@ -85,10 +84,6 @@ SERVED_MAX: Final = 200
 # At it: further ones are refused
 # Told in: status
 REQUESTS_MAX: Final = 1000
-# Messages kept in the form in which they were sent, for further clients of the same topic.
-SHARED_FRAMES: Final = 64
-# Bytes of these; larger messages are converted for each client.
-SHARED_BYTES: Final = 16 * MIB
 # [Rosbridge] Lists and objects within each other in a parameter
 # At it: it is refused
 # Told in: status

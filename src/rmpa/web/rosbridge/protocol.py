@@ -10,26 +10,25 @@ import base64
 import enum
 import json
 import math
-import struct
-import zlib
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cbor2
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
-from rmpa.web.clients.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode, size_of
+from rmpa.web.pictures import png_file, png_pixels
 from rmpa.web.rosbridge import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.ros.types.codec import MessageCodec
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
 
 
 Id: TypeAlias = str | int | None
@@ -192,13 +191,6 @@ def _cbor(data: Part) -> object:
     return values
 
 
-_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-_CHUNK: Final = struct.Struct(">I4s")
-_IHDR: Final = struct.Struct(">IIBBBBB")
-# Of zlib; higher ones take five times as long for a tenth less.
-_PNG_LEVEL: Final = 1
-
-
 class Compression(enum.IntEnum):
     """The ``compression`` of a subscription; of several, the highest is used."""
 
@@ -220,41 +212,12 @@ class Compression(enum.IntEnum):
         raise OpError(f"unknown compression {str(name)[:40]!r}", "it is none, png, cbor or cbor-raw")
 
 
-class PublishFrames:
-    """Encodes messages for subscribers, each once for all clients of a topic that want it alike.
+def encode_message(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
+    """A ``publish`` in JSON, PNG or CBOR.
 
-    A message is recognised by its payload, which must be the same memoryview for all. The last
-    `limits.SHARED_FRAMES` are kept.
+    Raises:
+        MessageError: The payload is not a message of the codec's type.
     """
-
-    def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[int, str, Compression], tuple[memoryview, OutFrame]] = OrderedDict()
-        self._bytes = 0
-
-    def encode(self, topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
-        """A ``publish`` in JSON, PNG or CBOR.
-
-        Raises:
-            MessageError: The payload is not a message of the codec's type.
-        """
-        key = (id(payload), topic, compression)
-        kept = self._kept.get(key)
-        if kept is not None:
-            # The payload is kept too, so its id cannot have been given to another.
-            self._kept.move_to_end(key)
-            return kept[1]
-        frame = _encode(topic, payload, compression, codec)
-        size = size_of(frame) + len(payload)
-        if size <= limits.SHARED_BYTES:
-            self._kept[key] = (payload, frame)
-            self._bytes += size
-            while self._bytes > limits.SHARED_BYTES or len(self._kept) > limits.SHARED_FRAMES:
-                _, (old, gone) = self._kept.popitem(last=False)
-                self._bytes -= size_of(gone) + len(old)
-        return frame
-
-
-def _encode(topic: str, payload: memoryview, compression: Compression, codec: MessageCodec) -> OutFrame:
     if compression is Compression.CBOR:
         return encode({"op": "publish", "topic": topic, "msg": codec.cbor_values(payload)}, compression)
     head = b'{"op":"publish","topic":' + msgspec.json.encode(topic) + b',"msg":'
@@ -268,11 +231,6 @@ def encode(values: Mapping[str, Any], compression: Compression = Compression.NON
         return Opcode.BINARY, (cbor2.dumps(values),)
     text = msgspec.json.encode(values)
     return encode_png(text) if compression is Compression.PNG else (Opcode.TEXT, (text,))
-
-
-def size_of(frame: OutFrame) -> int:
-    """Bytes of a frame."""
-    return sum(map(len, frame[1]))
 
 
 def data_of(frame: OutFrame) -> Part:
@@ -309,88 +267,23 @@ def encode_png(text: Part) -> OutFrame:
     row = 3 * width
     height = max(1, -(-len(text) // row))
     padded = bytes(text).ljust(row * height, b"\n")
-    pixels = b"".join(b"\x00" + padded[at : at + row] for at in range(0, len(padded), row))
-    picture = _SIGNATURE + _chunk(b"IHDR", _IHDR.pack(width, height, 8, 2, 0, 0, 0))
-    picture += _chunk(b"IDAT", zlib.compress(pixels, _PNG_LEVEL)) + _chunk(b"IEND", b"")
+    picture = png_file(width, height, 2, (padded[at : at + row] for at in range(0, len(padded), row)))
     return encode({"op": "png", "data": base64.b64encode(picture).decode()})
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
 def decode_png(text: str) -> str:
-    """The op in a client's picture: 8 bits, RGB or RGBA or grey, not interlaced.
+    """The op in a client's picture, as ``png_pixels`` reads it.
 
     Raises:
-        OpError: The text is not such a picture, or its pixels are not UTF-8.
+        RemoteProtocolError: The text is not such a picture, or its pixels are not UTF-8.
         LimitExceeded: Its pixels are too many.
     """
     try:
-        raw = base64.b64decode(text, validate=True)
-    except ValueError:
-        raise OpError("the data of a png is base64") from None
-    if not raw.startswith(_SIGNATURE):
-        raise OpError("the data of a png is no PNG picture")
-    header, packed = _chunks(memoryview(raw)[len(_SIGNATURE) :])
-    width, height, bits, colour, _, _, interlaced = header
-    step = {0: 1, 2: 3, 6: 4}.get(colour)
-    if bits != 8 or step is None or interlaced or not width or not height:
-        raise OpError("a png has 8 bits a channel in RGB, RGBA or grey, and is not interlaced")
-    size = height * (1 + width * step)
-    if size > limits.PNG_MAX:
-        raise LimitExceeded("picture of a png", size, limits.PNG_MAX)
-    unpacker = zlib.decompressobj()
-    try:
-        lines = unpacker.decompress(packed, size)
-    except zlib.error as error:
-        raise OpError(f"the picture of a png cannot be unpacked: {error}") from None
-    if len(lines) != size:
-        raise OpError(f"the picture of a png has {len(lines)} bytes, not {size}")
-    try:
-        return _unfilter(lines, width * step, step).decode()
+        return png_pixels(base64.b64decode(text, validate=True), limits.PNG_MAX).decode()
     except UnicodeDecodeError:
         raise OpError("the pixels of a png are not UTF-8") from None
-
-
-def _chunks(raw: memoryview) -> tuple[tuple[int, ...], bytes]:
-    header: tuple[int, ...] | None = None
-    packed = bytearray()
-    while len(raw) >= 12:
-        length, kind = _CHUNK.unpack_from(raw)
-        if length > len(raw) - 12:
-            break
-        data = raw[8 : 8 + length]
-        if kind == b"IHDR" and length == _IHDR.size:
-            header = _IHDR.unpack(data)
-        elif kind == b"IDAT":
-            packed += data
-        raw = raw[12 + length :]
-        if kind == b"IEND" and header is not None:
-            return header, bytes(packed)
-    raise OpError("the picture of a png ends too early")
-
-
-def _unfilter(lines: bytes, row: int, step: int) -> bytearray:
-    """Undo the filters of all lines (PNG, section 9): 1 left, 2 above, 3 their mean, 4 Paeth."""
-    out = bytearray()
-    above = bytearray(row)
-    for at in range(0, len(lines), row + 1):
-        kind, line = lines[at], bytearray(lines[at + 1 : at + 1 + row])
-        if kind > 4:
-            raise OpError(f"the picture of a png has a line with the unknown filter {kind}")
-        for index in range(row if kind else 0):
-            left, corner = (line[index - step], above[index - step]) if index >= step else (0, 0)
-            up = above[index]
-            if kind == 4:
-                # The first nearest to left + up - corner.
-                guess = min((left, up, corner), key=lambda each: abs(left + up - corner - each))
-            else:
-                guess = (left, up, (left + up) // 2)[kind - 1]
-            line[index] = (line[index] + guess) & 0xFF
-        out += line
-        above = line
-    return out
+    except ValueError:
+        raise OpError("the data of a png is base64") from None
 
 
 def split(frame: OutFrame, size: int, mid: Id) -> list[OutFrame]:

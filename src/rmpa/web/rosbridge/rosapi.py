@@ -20,7 +20,7 @@ from rmpa.ros.types.definitions import parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.values import SIZES
 from rmpa.web.hub.graph import GraphService, GraphTopic
-from rmpa.web.hub.params import MISSING
+from rmpa.web.hub.params import MISSING, ros_time
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 from rmpa.web.rosbridge.tf import SERVICE, SERVICE_TYPE
@@ -246,8 +246,7 @@ class Rosapi:
         }
 
     def _answer_get_time(self) -> Values:
-        secs, nsecs = divmod(max(0, self._client.hub.time.now_ns()), 1_000_000_000)
-        return {"time": {"secs": secs, "nsecs": nsecs}}
+        return {"time": ros_time(self._client.hub.time.now_ns())}
 
     def _is_parameter(self, name: str) -> bool:
         return self._client.read_param(name) is not MISSING

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rmpa.core.errors import RmpaError
 from rmpa.ros.types.codec import MessageCodec, codec_for
-from rmpa.web.clients.connection import ClientStream, Session, ops_of
+from rmpa.web.hub.connection import ClientStream, Session, ops_of
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import (
     Assembler,
@@ -17,11 +17,11 @@ from rmpa.web.rosbridge.protocol import (
     Id,
     OpError,
     Part,
-    PublishFrames,
     check_count,
     decode_png,
     encode,
     encode_cbor_raw,
+    encode_message,
     graph_name,
     id_of,
     parse_frame,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Coroutine, Mapping
 
-    from rmpa.web.clients.frame_writer import OutFrame
+    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower, Payload, Rights
     from rmpa.web.hub.services import ServedService
@@ -73,7 +73,6 @@ class _Topic(ClientStream):
         self.judged_at: float | None = None
         self._compression = Compression.NONE
         self._fragment_size: int | None = None
-        self._codecs: dict[tuple[str, str], MessageCodec] = {}
         self._problem = ""
 
     def choose(self) -> None:
@@ -84,7 +83,7 @@ class _Topic(ClientStream):
         self._compression = max(compressions)
         self._fragment_size = min(filter(None, sizes), default=None)
 
-    def frames(self, message: ReceivedMessage, now: float) -> list[OutFrame]:  # noqa: ARG002
+    def frames(self, message: ReceivedMessage) -> list[OutFrame]:
         """The frames of a message; none of one that is broken."""
         try:
             return self._session.split(self._encode(message), self._fragment_size)
@@ -98,11 +97,12 @@ class _Topic(ClientStream):
     def _encode(self, message: ReceivedMessage) -> OutFrame:
         if self._compression is Compression.CBOR_RAW:
             return encode_cbor_raw(self.name, message.payload, message.stamp_ns)
-        version = message.type, message.md5sum
-        codec = self._codecs.get(version)
-        if codec is None:
-            codec = self._codecs[version] = codec_for(self._session.hub.types.version(*version))
-        return self._session.encoder.encode(self.name, message.payload, self._compression, codec)
+        hub = self._session.hub
+
+        def make() -> OutFrame:
+            return encode_message(self.name, message.payload, self._compression, hub.types.codec(message))
+
+        return hub.frames.get(message.payload, make, self.name, self._compression)
 
 
 @dataclass(slots=True)
@@ -144,20 +144,15 @@ class RosbridgeSession(Session):
     Args:
         hub: The hub.
         rights: What the client may do.
-        priority: The priority of a topic's messages.
         address: The client's, for logs.
-        encoder: Encodes messages; one for all sessions of a process.
     """
 
     kind = "rosbridge"
     frame_max = limits.FRAME_MAX
 
     # More than 12 fields: what the client has of each kind, and what it has in fragments.
-    def __init__(
-        self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str, encoder: PublishFrames
-    ) -> None:
-        super().__init__(hub, rights, priority, address)
-        self.encoder = encoder
+    def __init__(self, hub: Hub, rights: Rights, address: str) -> None:
+        super().__init__(hub, rights, address)
         self._rosapi = Rosapi(self)
         self._tf = TfRepublisher(self)
         self._level = "error"
@@ -325,7 +320,7 @@ class RosbridgeSession(Session):
 
     def _is_there(self, name: str) -> bool:
         known = self.hub.graph.topics.get(name)
-        is_own = name in self.hub.topics.publishers.names or self._tf.publishes(name)
+        is_own = name in self.hub.topics.published or self._tf.publishes(name)
         return bool(known is not None and known.types) or is_own
 
     def _begin_topic(self, spelling: str, name: str, kind: str | None) -> _Topic:

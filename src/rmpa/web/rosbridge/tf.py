@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.installed import ServiceType
 from rmpa.web.hub.node_link import Follower
+from rmpa.web.hub.params import ros_time
 from rmpa.web.hub.topics import ReceivedMessage
 from rmpa.web.hub.transforms import Transform, frame_name
 from rmpa.web.rosbridge import limits
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.core.errors import RmpaError
-    from rmpa.web.clients.connection import Session
+    from rmpa.web.hub.connection import Session
 
 ACTION: Final = "/tf2_web_republisher"
 SERVICE: Final = "/republish_tfs"
@@ -108,9 +109,7 @@ class TfRepublisher:
 
     def subscribe(self, topic: str, receive: Callable[[ReceivedMessage], None]) -> Follower:
         """Subscribe to a topic of ``publishes``."""
-        made = Follower(self._streams)
-        self._streams[made] = topic, receive
-        return made
+        return Follower(self._streams, (topic, receive))
 
     def call(self, arguments: Any, now: float) -> Values:
         """Answer ``/republish_tfs``."""
@@ -223,7 +222,7 @@ class TfRepublisher:
 
     def _moved(self, request: _Request) -> list[Values]:
         tree, rows = self._client.hub.transforms, []
-        secs, nsecs = divmod(self._client.hub.time.now_ns(), 1_000_000_000)
+        stamp = ros_time(self._client.hub.time.now_ns())
         for frame in request.frames:
             place, last = tree.lookup(request.target, frame), request.sent.get(frame)
             if place is None or (
@@ -234,7 +233,7 @@ class TfRepublisher:
             ):
                 continue
             request.sent[frame] = place
-            header = {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": request.target}
+            header = {"stamp": stamp, "frame_id": request.target}
             rows.append({"header": header, "child_frame_id": frame, "transform": place.values()})
         return rows
 

@@ -17,82 +17,72 @@ from __future__ import annotations
 import asyncio
 import hmac
 import ipaddress
-import logging
 import os
 import re
 import secrets
 import stat
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias, cast
+
+import msgspec
 
 from rmpa.core.errors import StartError
-from rmpa.core.log import RefusalLog
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import MaskCheck
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from rmpa.core.statistics import Counters
+    from aiohttp import web
 
-_log = logging.getLogger(__name__)
+    from rmpa.core.log import RefusalLog
+
 TOKEN_PARAMETER: Final = "token"  # noqa: S105 - its name, not its value
 _HOST: Final = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9_.-]+))(?::[0-9]{1,5})?")
 _SHOWN: Final = 80
 
-
-@dataclass(frozen=True, slots=True)
-class RequestFacts:
-    """What the decision is made of. ``None`` is a header that is missing.
-
-    Attributes:
-        host: All ``Host`` headers; HTTP/1.1 has exactly one.
-        origin: ``Origin``.
-        fetch_site: ``Sec-Fetch-Site``, which pages cannot set.
-        fetch_mode: ``Sec-Fetch-Mode``.
-        authorization: ``Authorization``.
-        cookie: The value of the token's cookie.
-        token: The query's ``token``.
-        is_page: Whether the path is a page for people, for which a cookie is set.
-        is_open: Whether the path needs no token.
-        is_picture: Whether the path gives pictures, which other sites' pages show by ``<img>``.
-        is_preflight: Whether a browser asks what a page of another site may send (Fetch standard, "CORS-preflight").
-        secure: Whether it came by HTTPS.
-    """
-
-    host: tuple[str, ...]
-    origin: str | None = None
-    fetch_site: str | None = None
-    fetch_mode: str | None = None
-    authorization: str | None = None
-    cookie: str | None = None
-    token: str | None = None
-    is_page: bool = False
-    is_open: bool = False
-    is_picture: bool = False
-    is_preflight: bool = False
-    secure: bool = False
+_TITLES: Final = {
+    400: "Bad request",
+    401: "A token is needed",
+    403: "Refused",
+    404: "Not found",
+    405: "Method not allowed",
+    413: "Too large",
+    415: "Not an image",
+    429: "Too many at one time",
+    500: "Internal error",
+    502: "Not made",
+    503: "The agent does not answer",
+    504: "No picture",
+}
 
 
-class AccessRefused(NamedTuple):
-    """The request is not served.
+class Problem(Exception):  # noqa: N818 - the word of RFC 9457
+    """Why a request has no result (RFC 9457).
 
-    Attributes:
-        reason: ``host``, ``origin`` or ``token``, for the counter.
+    Args:
         status: The HTTP status.
-        detail: What happened and what to do.
+        detail: What happened, and what to do.
+        reason: One of ``api.REFUSALS``, by which it is counted and logged; empty: it is neither.
     """
 
-    reason: str
-    status: int
-    detail: str
+    def __init__(self, status: int, detail: str, reason: str = "") -> None:
+        super().__init__(detail)
+        self.status, self.detail, self.reason = status, detail, reason
+
+    @property
+    def body(self) -> bytes:
+        """Its problem details, of the type ``application/problem+json``."""
+        return msgspec.json.encode({"title": _TITLES[self.status], "status": self.status, "detail": self.detail})
 
 
+# What stands at a path: ``page``: for people, and a cookie is set for it; ``open``: it needs no token; ``pictures``,
+# which other sites' pages show by ``<img>``; or anything else.
+Place: TypeAlias = Literal["page", "open", "pictures", ""]
 # ``move token``: the page is served at the same URL without its token, which becomes a cookie. ``preflight``: the
 # browser is told what pages of a listed site may send.
-Verdict: TypeAlias = AccessRefused | Literal["granted", "move token", "preflight"]
+Verdict: TypeAlias = Literal["granted", "move token", "preflight"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,69 +106,77 @@ class AccessPolicy:
         """The name of the token's cookie."""
         return f"rmpa_token_{self.port}"
 
-    def judge(self, request: RequestFacts) -> Verdict:
-        """The decision about a request."""
-        refused = self._wrong_host(request) or self._wrong_origin(request)
-        if refused is not None:
-            return refused
-        if request.is_preflight and self.lists(request.origin):
+    def judge(self, request: web.BaseRequest, place: Place = "", *, shared: bool = True) -> Verdict:
+        """The decision about a request.
+
+        Args:
+            request: The request.
+            place: What it asks for.
+            shared: Whether pages of listed sites may read that.
+
+        Raises:
+            Problem: It is not served, for its ``host``, ``origin`` or ``token``.
+        """
+        self._check_host(request)
+        self._check_origin(request, place)
+        is_preflight = request.method == "OPTIONS" and "Access-Control-Request-Method" in request.headers
+        if is_preflight and shared and self.lists(request.headers.get("Origin")):
             return "preflight"
-        return self._by_token(request)
+        return self._by_token(request, place)
 
     def lists(self, origin: str | None) -> bool:
         """Whether an ``Origin`` is one of ``origins``; ``*`` never is."""
         return origin is not None and origin != "*" and origin.lower() in self.origins
 
-    def _wrong_host(self, request: RequestFacts) -> AccessRefused | None:
-        if len(request.host) != 1:
-            return AccessRefused("host", 400, f"the request has {len(request.host)} Host headers; send exactly one")
-        host = request.host[0]
-        name = host_name(host)
-        if name is not None and (is_address(name) or name in self.hosts):
-            return None
-        remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
-        return AccessRefused("host", 403, f"{_short(host)} is no name of this server; {remedy}")
+    def _check_host(self, request: web.BaseRequest) -> None:
+        hosts = request.headers.getall("Host", ())
+        if len(hosts) != 1:
+            raise Problem(400, f"the request has {len(hosts)} Host headers; send exactly one", "host")
+        name = host_name(hosts[0])
+        if name is None or not (is_address(name) or name in self.hosts):
+            remedy = "use its address, or add the name with --host (hosts of [web] in rmpa.toml)"
+            raise Problem(403, f"{_short(hosts[0])} is no name of this server; {remedy}", "host")
 
-    def _wrong_origin(self, request: RequestFacts) -> AccessRefused | None:
-        if request.origin is not None:
-            scheme, _, rest = request.origin.partition("://")
+    def _check_origin(self, request: web.BaseRequest, place: Place) -> None:
+        headers = request.headers
+        origin = headers.get("Origin")
+        if origin is not None:
+            scheme, _, rest = origin.partition("://")
             # A page of plain HTTP may be forged on its way, so it is no page of a server of HTTPS. A server of plain
             # HTTP may be behind a proxy that ends TLS: its own pages are then of HTTPS.
             schemes = ("https",) if request.secure else ("http", "https")
-            if scheme in schemes and rest.lower() == request.host[0].lower():
-                return None
-            if self.lists(request.origin):
-                return None
-            return _foreign(_short(request.origin))
-        elsewhere = request.fetch_site in ("cross-site", "same-site")
+            if not ((scheme in schemes and rest.lower() == headers["Host"].lower()) or self.lists(origin)):
+                raise _foreign(_short(origin))
+            return
         # Only the token in the URL counts: a browser sends a cookie with requests of any site.
-        if request.is_picture and self.token and self._fits(request.token):
-            return None
+        if place == "pictures" and self.token and self._fits(request.query.get(TOKEN_PARAMETER)):
+            return
         # A link on another page may lead here: the browser shows the page, and the other page cannot read it.
-        if elsewhere and not (request.fetch_mode == "navigate" and request.is_page):
-            return _foreign("another site")
-        return None
+        leads = place == "page" and headers.get("Sec-Fetch-Mode") == "navigate"
+        if headers.get("Sec-Fetch-Site") in ("cross-site", "same-site") and not leads:
+            raise _foreign("another site")
 
-    def _by_token(self, request: RequestFacts) -> Verdict:
-        if not self.token or request.is_open:
+    def _by_token(self, request: web.BaseRequest, place: Place) -> Verdict:
+        if not self.token or place == "open":
             return "granted"
-        if self._fits(request.token):
-            return "move token" if request.is_page else "granted"
-        given = (bearer(request.authorization), request.cookie)
+        asked = request.query.get(TOKEN_PARAMETER)
+        if self._fits(asked):
+            return "move token" if place == "page" else "granted"
+        given = (bearer(request.headers.get("Authorization")), request.cookies.get(self.cookie))
         if any(map(self._fits, given)):
             return "granted"
-        is_given = any(each is not None for each in (request.token, *given))
+        is_given = any(each is not None for each in (asked, *given))
         problem = "the token is wrong" if is_given else "this server needs a token"
         remedy = "send it as Authorization: Bearer TOKEN or as ?token=TOKEN"
-        return AccessRefused("token", 401, f"{problem}; {remedy}; rmpa web says at its start where the token is")
+        raise Problem(401, f"{problem}; {remedy}; rmpa web says at its start where the token is", "token")
 
     def _fits(self, token: str | None) -> bool:
         return token is not None and hmac.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
 
 
-def _foreign(whose: str) -> AccessRefused:
+def _foreign(whose: str) -> Problem:
     remedy = "open its own pages instead, or list it as origins of [web]"
-    return AccessRefused("origin", 403, f"pages of {whose} may not read from this server; {remedy}")
+    return Problem(403, f"pages of {whose} may not read from this server; {remedy}", "origin")
 
 
 def bearer(authorization: str | None) -> str | None:
@@ -271,12 +269,12 @@ class ConnectionTable:
 
     Args:
         make_protocol: Makes aiohttp's protocol of a new connection.
-        counters: Counts what is closed, by its reason (``api.REFUSALS``).
+        refusals: Counts and tells what is closed, by its reason (``api.REFUSALS``).
     """
 
-    def __init__(self, make_protocol: Callable[[], asyncio.Protocol], counters: Counters) -> None:
+    def __init__(self, make_protocol: Callable[[], asyncio.Protocol], refusals: RefusalLog) -> None:
         self._make_protocol = make_protocol
-        self.refusals = RefusalLog(_log, counters)
+        self.refusals = refusals
         # The connections, the idlest first.
         self.open: dict[GuardedConnection, None] = {}
         # Connections so far.
@@ -304,6 +302,54 @@ class ConnectionTable:
             connection.abort()
 
 
+# Bits of the first byte of a frame, and of the second one.
+_LAST, _CONTROL = 0x80, 0x08
+_MASKED: Final = 0x80
+_MASK_BYTES: Final = 4
+
+
+class FrameCheck:
+    """Follows the frames of a client: the library takes some without a mask, and does not tell of half a message.
+
+    A message may come in fragments, and control frames between them (RFC 6455, sections 5.1 and 5.4).
+    """
+
+    def __init__(self) -> None:
+        self._header = bytearray()
+        # Bytes of the frame's payload that are still to come, its mask included.
+        self._payload = 0
+        # Whether a message ends with the frame.
+        self._ends = False
+        # Since when a message has been arriving; ``None``: none is.
+        self.since: float | None = None
+
+    def passes(self, data: bytes, now: float) -> bool:
+        """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
+        at = 0
+        while at < len(data):
+            if self._payload:
+                taken = min(self._payload, len(data) - at)
+                self._payload -= taken
+                at += taken
+                if not self._payload and self._ends:
+                    self.since = None
+                continue
+            self._header.append(data[at])
+            at += 1
+            if len(self._header) == 1:
+                self._ends = self._header[0] & (_LAST | _CONTROL) == _LAST
+                if self.since is None and not self._header[0] & _CONTROL:
+                    self.since = now
+            length = self._header[1] & ~_MASKED if len(self._header) > 1 else 0
+            if len(self._header) == 2 and not self._header[1] & _MASKED:
+                return False
+            extra = {126: 2, 127: 8}.get(length, 0)
+            if len(self._header) == 2 + extra:
+                self._payload = _MASK_BYTES + (int.from_bytes(self._header[2:], "big") if extra else length)
+                self._header.clear()
+        return True
+
+
 class ConnectionPhase(Enum):
     """What a connection waits for."""
 
@@ -329,10 +375,11 @@ class GuardedConnection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._since_response = 0
-        self._mask = MaskCheck()
         self._on_unmasked: Callable[[], None] | None = None
         self._on_lost: Callable[[], None] = lambda: None
         self.phase = ConnectionPhase.IDLE
+        # Of a WebSocket.
+        self.frames = FrameCheck()
         # Bytes of the client so far.
         self.received = 0
 
@@ -379,7 +426,7 @@ class GuardedConnection(asyncio.Protocol):
         if self.phase is ConnectionPhase.UPGRADED:
             if self._on_unmasked is None:
                 return
-            if not self._mask.passes(data):
+            if not self.frames.passes(data, self._loop.time()):
                 self._on_unmasked()
                 self._on_unmasked = None
                 return
@@ -449,3 +496,9 @@ class GuardedConnection(asyncio.Protocol):
             self._timer = late(response, self.refuse, "slow_response", "it does not read the response")
         elif phase is ConnectionPhase.IDLE:
             self._timer = late(limits.WEB_IDLE_TIMEOUT, self.abort)
+
+
+def guard_of(request: web.BaseRequest) -> GuardedConnection | None:
+    """What guards the connection of a request; ``None``: nothing does."""
+    protocol = request.transport.get_protocol() if request.transport is not None else None
+    return protocol if isinstance(protocol, GuardedConnection) else None

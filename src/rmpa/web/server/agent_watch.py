@@ -14,9 +14,10 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.graph import GraphRevision
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust.permissions import TrustStatus
 from rmpa.web import limits
+from rmpa.web.hub.services import SharedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -63,7 +64,7 @@ class AgentWatch:
         self._clock = clock
         self._thread = ThreadPoolExecutor(1, "rmpa-agent-watch")
         self._last: dict[bool, Reading] = {}
-        self._pending: dict[bool, asyncio.Task[Reading]] = {}
+        self._asking: SharedTasks[bool, Reading] = SharedTasks()
         # Questions to the agent so far.
         self.reads = 0
         # Seconds that they took in total.
@@ -80,12 +81,10 @@ class AgentWatch:
             usual = await self.reading()
             if usual.snapshot is None or not (usual.snapshot.topics_left or usual.snapshot.services_left):
                 return usual
-        if whole not in self._pending:
-            last, age = self._last.get(whole), limits.WEB_WHOLE_AGE if whole else limits.WEB_SNAPSHOT_AGE
-            if last is not None and self._clock() - last.taken < age:
-                return last
-            self._pending[whole] = start_task(self._ask(whole), "read the agent's snapshot")
-        return await asyncio.shield(self._pending[whole])  # a client that leaves must not end it for the others
+        last, age = self._last.get(whole), limits.WEB_WHOLE_AGE if whole else limits.WEB_SNAPSHOT_AGE
+        if last is not None and self._clock() - last.taken < age:
+            return last
+        return await self._asking.get(whole, lambda: self._ask(whole))
 
     async def _ask(self, whole: bool) -> Reading:
         began, before = self._clock(), self._last.get(whole)
@@ -94,8 +93,6 @@ class AgentWatch:
             snapshot = await asyncio.get_running_loop().run_in_executor(self._thread, self._read[whole])
         except RmpaError as error:
             problem = str(error)
-        finally:
-            del self._pending[whole]
         now = self._clock()
         self.reads += 1
         self.seconds += now - began
@@ -109,9 +106,8 @@ class AgentWatch:
 
     async def close(self) -> None:
         """Wait for a question under way, at most ``limits.WEB_AGENT_TIMEOUT``, and end the thread."""
-        if self._pending:
-            await asyncio.wait([*self._pending.values()])
-        self._thread.shutdown()
+        await self._asking.close()
+        await asyncio.to_thread(self._thread.shutdown)
 
 
 class ControlReader:

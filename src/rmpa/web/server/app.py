@@ -7,7 +7,6 @@ upgrades included, before its handler runs.
 from __future__ import annotations
 
 import asyncio
-import functools
 import html
 import itertools
 import logging
@@ -23,14 +22,14 @@ from rmpa.core.errors import StartError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.web import api, limits
-from rmpa.web.clients.clients import MONITOR_PATH, is_upgrade
+from rmpa.web.clients import MONITOR_PATH, is_upgrade
 from rmpa.web.server.access import (
     TOKEN_PARAMETER,
     AccessPolicy,
-    AccessRefused,
+    ConnectionPhase,
     ConnectionTable,
-    GuardedConnection,
-    RequestFacts,
+    Problem,
+    guard_of,
     host_name,
     is_loopback,
 )
@@ -44,7 +43,8 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler
 
-    from rmpa.web.clients.clients import WebSocketClients
+    from rmpa.web.clients import WebSocketClients
+    from rmpa.web.server.access import Place
     from rmpa.web.server.agent_watch import AgentWatch
     from rmpa.web.server.recordings import RecordingFiles
     from rmpa.web.server.video import VideoStreams
@@ -169,6 +169,7 @@ class WebServer:
             StartError: The address cannot be used.
         """
         app = web.Application(middlewares=[self._middleware])
+        app.on_response_prepare.append(self._dress)
         for path in self._pages:
             app.router.add_get(path, self._page)
         app.router.add_get("/metrics", self._metrics)
@@ -177,10 +178,9 @@ class WebServer:
         if self._video is not None:
             app.router.add_get(VIEWER, self._video.page)
             for path in PICTURES:
-                app.router.add_get(path, functools.partial(self._streamed, self._video))
+                app.router.add_get(path, self._video.respond)
         if self._recordings is not None:
-            handler = functools.partial(self._streamed, self._recordings)
-            app.router.add_get(ROUTE, handler, allow_head=False)
+            app.router.add_get(ROUTE, self._recordings.respond, allow_head=False)
         self._runner = runner = web.AppRunner(
             app,
             access_log_class=self._access_logger(),
@@ -195,7 +195,7 @@ class WebServer:
         )
         await runner.setup()
         assert runner.server is not None, "setup() makes it"  # noqa: S101 - for the type checker
-        self._table = ConnectionTable(runner.server, self.counters)
+        self._table = ConnectionTable(runner.server, self._refusals)
         for host, port in self._addresses:
             try:
                 server = await asyncio.get_running_loop().create_server(
@@ -242,20 +242,26 @@ class WebServer:
     @web.middleware
     async def _middleware(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         request[_JUDGED] = True
-        connection = _connection(request)
-        if connection is not None:
-            connection.request_begins()
+        guard = guard_of(request)
+        if guard is not None:
+            guard.request_begins()
         try:
-            response = await self._respond(request, handler)
+            return await self._respond(request, handler)
+        except Problem as problem:
+            return self._refused(request, problem)
+        except web.HTTPException:  # of aiohttp's router: no such path
+            return self._refused(request, Problem(404, f"there is no {request.path[:80]!a}; / lists what there is"))
+        except Exception:  # noqa: BLE001 - the top of the request: a fault in one path must not end the connection's task
+            _log.exception("! %s%s failed", "the WebSocket at " if is_upgrade(request) else "", request.path)
+            return self._refused(request, Problem(500, "the server failed; its log says why"))
         finally:
-            if connection is not None:
-                connection.request_ends()
-        if not response.prepared:
-            self._dress(request, response)
-        return response
+            if guard is not None:
+                guard.request_ends()
 
-    def _dress(self, request: web.Request, response: web.StreamResponse) -> None:
+    async def _dress(self, request: web.Request, response: web.StreamResponse) -> None:
         """Give a response the headers that all have; pictures are shown by other pages, too, which had the token."""
+        if isinstance(response, web.WebSocketResponse):
+            return
         response.headers.update(HEADERS)
         response.headers.update(self._sharing(request))
         if request.path in PICTURES and TOKEN_PARAMETER in request.query:
@@ -264,59 +270,36 @@ class WebServer:
             response.headers.update((OPENER_POLICY,))
 
     async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        verdict = self._policy.judge(self._facts(request))
-        if isinstance(verdict, AccessRefused):
-            return self._refused(request, verdict.reason, api.problem(verdict.status, verdict.detail))
+        shared = request.path not in self._pages
+        verdict = self._policy.judge(request, self._place(request), shared=shared)
         if request.method not in _METHODS and verdict != "preflight":
             text = f"{request.method[:20]} is not supported; this server only shows, and is read with GET"
-            return self._refused(request, "method", api.problem(405, text, (("Allow", ", ".join(_METHODS)),)))
+            raise Problem(405, text, "method")
         if request.body_exists:
-            return self._refused(request, "body", api.problem(413, "a request with a body; send none with GET"))
+            raise Problem(413, "a request with a body; send none with GET", "body")
         if verdict == "preflight":
             return web.Response(status=204, headers=PREFLIGHT)
         if verdict == "move token":
             return self._move_token(request)
-        if self._clients is not None and is_upgrade(request) and request.path in WEBSOCKET_PATHS:
-            return await self._upgrade(request, self._clients)
-        try:
+        sockets = self._clients
+        if sockets is None or not is_upgrade(request) or request.path not in WEBSOCKET_PATHS:
             return await handler(request)
-        except web.HTTPException:  # of aiohttp's router: no such path
-            return _response(api.problem(404, f"there is no {request.path[:80]!a}; / lists what there is"))
-        except Exception:  # noqa: BLE001 - the top of the request: a fault in one path must not end the connection's task
-            _log.exception("! %s failed", request.path)
-            return _response(api.problem(500, "the server failed; its log says why"))
-
-    async def _upgrade(self, request: web.Request, sockets: WebSocketClients) -> web.StreamResponse:
-        """Serve a WebSocket until it has ended."""
         try:
-            return await sockets.handle(request, _connection(request))
+            return await sockets.handle(request)  # until it has ended
         except web.HTTPBadRequest as error:  # of aiohttp's handshake
             text = (error.text or "").partition("\n")[0][:_SHOWN]
             sockets.refuse(request.remote or "?", "handshake", text)
-            return _response(api.problem(400, f"not the handshake of a WebSocket: {text}"))
-        except Exception:  # noqa: BLE001 - as above
-            _log.exception("! the WebSocket at %s failed", request.path)
-            return _response(api.problem(500, "the server failed; its log says why"))
+            raise Problem(400, f"not the handshake of a WebSocket: {text}") from None
 
-    def _facts(self, request: web.Request) -> RequestFacts:
-        headers, path = request.headers, request.path
-        content_type = self._pages[path][1] if path in self._pages and not is_upgrade(request) else ""
-        return RequestFacts(
-            host=tuple(headers.getall("Host", ())),
-            origin=headers.get("Origin"),
-            fetch_site=headers.get("Sec-Fetch-Site"),
-            fetch_mode=headers.get("Sec-Fetch-Mode"),
-            authorization=headers.get("Authorization"),
-            cookie=request.cookies.get(self._policy.cookie),
-            token=request.query.get(TOKEN_PARAMETER),
-            is_page=content_type.startswith("text/html") or (path == VIEWER and self._video is not None),
-            is_picture=path in PICTURES,
-            is_open=request.path == _HEALTH,
-            is_preflight=request.method == "OPTIONS"
-            and "Access-Control-Request-Method" in headers
-            and request.path not in self._pages,
-            secure=request.secure,
-        )
+    def _place(self, request: web.Request) -> Place:
+        path = request.path
+        if path == _HEALTH:
+            return "open"
+        if path in PICTURES:
+            return "pictures"
+        _, content_type = self._pages.get(path, (b"", ""))
+        is_page = content_type.startswith("text/html") and not is_upgrade(request)
+        return "page" if is_page or (path == VIEWER and self._video is not None) else ""
 
     def _sharing(self, request: web.Request) -> dict[str, str]:
         """Headers that let pages of listed sites read a response; those of the pages' own files are not shared."""
@@ -326,14 +309,24 @@ class WebServer:
         allowed = {"Access-Control-Allow-Origin": origin} if origin is not None and self._policy.lists(origin) else {}
         return {"Vary": "Origin", **allowed}
 
-    def _refused(self, request: web.Request, reason: str, problem: api.RestResponse) -> web.Response:
-        address = request.remote or "?"
-        self._refusals.refuse(time.monotonic(), reason, address, f"{address}: {problem.detail}")
-        response = _page_of(problem) if _is_for_people(request) else _response(problem)
+    def _refused(self, request: web.Request, problem: Problem) -> web.Response:
+        """The response that says a problem: a page to people, as programs ask for no HTML; else its details."""
+        shown, content_type = problem.body, "application/problem+json"
+        if problem.reason:
+            address = request.remote or "?"
+            self._refusals.refuse(time.monotonic(), problem.reason, address, f"{address}: {problem.detail}")
+            if not is_upgrade(request) and "text/html" in request.headers.get("Accept", ""):
+                text, help_ = html.escape(problem.detail), _SIGN_IN if problem.status == 401 else ""
+                shown = _REFUSED_PAGE.format(text=text[:1].upper() + text[1:], help=help_).encode()
+                content_type = "text/html; charset=utf-8"
+        response = web.Response(status=problem.status, body=shown, headers={"Content-Type": content_type})
         if problem.status == 401:
             response.headers["WWW-Authenticate"] = 'Bearer realm="rmpa"'
-        if request.body_exists:
-            response.force_close()
+        elif problem.status == 405:
+            response.headers["Allow"] = ", ".join(_METHODS)
+        guard = guard_of(request)
+        if request.body_exists or (guard is not None and guard.phase is ConnectionPhase.UPGRADED):
+            response.force_close()  # what comes behind is the body, or is not looked at any more
         return response
 
     def _move_token(self, request: web.Request) -> web.Response:
@@ -354,16 +347,13 @@ class WebServer:
     async def _health(self, _request: web.Request) -> web.Response:
         reading = await self._watch.reading()
         if reading.snapshot is None:
-            return _response(api.problem(503, "the agent does not answer"))
+            raise Problem(503, "the agent does not answer")
         return web.Response(text="ok\n")
-
-    async def _streamed(self, source: VideoStreams | RecordingFiles, request: web.Request) -> web.StreamResponse:
-        made = await source.respond(request, _connection(request), functools.partial(self._dress, request))
-        return _response(made) if isinstance(made, api.RestResponse) else made
 
     async def _api(self, request: web.Request) -> web.Response:
         reading = await self._watch.reading(whole=True)
-        return _response(api.respond(request.rel_url.raw_path, reading.snapshot, reading.problem))
+        body = api.respond(request.rel_url.raw_path, reading.snapshot, reading.problem)
+        return web.Response(body=body, headers={"Content-Type": "application/json"})
 
     async def _metrics(self, request: web.Request) -> web.Response:
         form = api.content_type(request.headers.get("Accept", ""))
@@ -399,27 +389,3 @@ class WebServer:
             address = request.remote or "?"
             text = f"{address}: not HTTP/1.1, or a header beyond a limit (docs/reference/limits.md)"
             self._refusals.refuse(time.monotonic(), "malformed", address, text)
-
-
-def _connection(request: web.Request) -> GuardedConnection | None:
-    transport = request.transport
-    protocol = transport.get_protocol() if transport is not None else None
-    return protocol if isinstance(protocol, GuardedConnection) else None
-
-
-def _is_for_people(request: web.Request) -> bool:
-    """Whether a browser shows the response: programs ask for no HTML."""
-    return not is_upgrade(request) and "text/html" in request.headers.get("Accept", "")
-
-
-def _page_of(problem: api.RestResponse) -> web.Response:
-    text = html.escape(problem.detail)
-    help_ = _SIGN_IN if problem.status == 401 else ""
-    page = _REFUSED_PAGE.format(text=text[:1].upper() + text[1:], help=help_)
-    headers = {"Content-Type": "text/html; charset=utf-8", **dict(problem.headers)}
-    return web.Response(status=problem.status, body=page.encode(), headers=headers)
-
-
-def _response(made: api.RestResponse) -> web.Response:
-    headers = {"Content-Type": made.content_type, **dict(made.headers)}
-    return web.Response(status=made.status, body=made.body, headers=headers)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.config.module_name import module_dir, state_dir
-from rmpa.core.contract import Priority
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 from rmpa.discovery.network import choose, list_interfaces, pick_address
 from rmpa.ros.node.node import Node
@@ -23,8 +22,8 @@ from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.trust.permissions import Permissions, server_names
 from rmpa.trust.store import CERTIFICATE, KEY
 from rmpa.web import limits
-from rmpa.web.clients.clients import WebSocketClients
-from rmpa.web.clients.connection import Session
+from rmpa.web.clients import WebSocketClients
+from rmpa.web.hub.connection import Session
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, READ_ONLY, NodeRules, Rights
 from rmpa.web.monitor.monitor import Monitor
@@ -45,16 +44,16 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _DEFAULT_PORT: Final = 8480
-_PRIORITIES: Final = {Priority.HIGH: 1, Priority.NORMAL: 0, Priority.LOW: -1}
 
 
-def make_hub(watch: AgentWatch, port: int, rules: NodeRules = EVERYTHING) -> Hub:
+def make_hub(watch: AgentWatch, port: int, rules: NodeRules = EVERYTHING, contracts: Contracts | None = None) -> Hub:
     """A hub whose master is the agent's.
 
     Args:
         watch: Gives the agent's snapshot.
         port: The server's; each server of one core has a node of its own.
         rules: What the node may do.
+        contracts: Of topics.
     """
     name = "rmpa_web" if port == _DEFAULT_PORT else f"rmpa_web_{port}"
 
@@ -67,18 +66,7 @@ def make_hub(watch: AgentWatch, port: int, rules: NodeRules = EVERYTHING) -> Hub
     def make_node(uri: str, updated: Callable[[str, XmlRpcValue], None]) -> Node:
         return Node(name, master_uri=uri, on_param_update=updated)
 
-    return Hub(where, make_node, rules=rules)
-
-
-def priority_of(hub: Hub, contracts: Contracts) -> Callable[[str], int]:
-    """The priority of a topic's messages, by its contract."""
-
-    def priority(topic: str) -> int:
-        known = hub.graph.topics.get(topic)
-        type_ = known.types[0] if known is not None and known.types else ""
-        return _PRIORITIES[contracts.of(topic, type_).priority]
-
-    return priority
+    return Hub(where, make_node, rules=rules, contracts=contracts)
 
 
 class CertificateFiles(NamedTuple):
@@ -348,16 +336,15 @@ async def serve(
     follower = AgentFollower(os.environ, agent, setup.fits)
     reader = ControlReader(os.environ, agent, follower.check)
     watch = AgentWatch(reader, read_whole=reader.read_whole)
-    hub = make_hub(watch, web.port, setup.rules)
+    hub = make_hub(watch, web.port, setup.rules, setup.settings.make_contracts())
     monitor = Monitor(hub, watch, agent=agent, folder=setup.settings.resources.folder)
-    name, priority = f"RMPA {setup.module or socket.gethostname()}", priority_of(hub, setup.settings.make_contracts())
-    sockets = WebSocketClients(hub, name, setup.rights, priority, monitor, other_protocols())
+    name = f"RMPA {setup.module or socket.gethostname()}"
+    sockets = WebSocketClients(hub, name, setup.rights, monitor, other_protocols())
     certificate = ServerCertificate(setup.files)
     video = VideoStreams(hub)
     place = state_dir(os.environ, setup.settings.state_dir or None)
     files = module_dir(place, setup.module) / f"web-{web.port}" if place is not None else None
-    view, name_of = setup.rights.view, lambda: agent or monitor.mesh.agent
-    recordings = RecordingFiles(setup.rules, files, name_of, view=view)
+    recordings = RecordingFiles(setup.rules, files, lambda: monitor.agent, view=setup.rights.view)
     server = WebServer(watch, setup.policy, web.listen, sockets, web.ports, certificate.context, video, recordings)
     try:
         async with hub:

@@ -25,14 +25,14 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, missing_extra
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
-from rmpa.web import api, limits
+from rmpa.web import limits
+from rmpa.web.server.access import Problem, guard_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from rmpa.web.hub.node_link import NodeRules
-    from rmpa.web.server.access import GuardedConnection
 
 ROUTE: Final = "/recording/{name}"
 _TYPES: Final = dict.fromkeys(("mcap", "bag", "html"), "application/octet-stream") | {"json": "application/json"}
@@ -99,10 +99,12 @@ class RecordingFiles:
         await self._idle.close()
         await self.clear()
 
-    async def respond(
-        self, request: web.Request, guard: GuardedConnection | None, dress: Callable[[web.StreamResponse], None]
-    ) -> web.StreamResponse | api.RestResponse:
-        """A response to a request for a file; arguments as of ``VideoStreams.respond``."""
+    async def respond(self, request: web.Request) -> web.StreamResponse:
+        """A response to a request for a file.
+
+        Raises:
+            Problem: There is none, or it cannot be made.
+        """
         name = request.match_info["name"]
         recording, _, kind = name.rpartition(".")
         try:
@@ -110,24 +112,23 @@ class RecordingFiles:
                 raise PeerRefused("the web server", _NO_TOKEN)
             self._rules.check(Access.RECORD, f"/{check_id(recording)}")
         except RmpaError as error:
-            return api.problem(403 if isinstance(error, PeerRefused) else 404, str(error))
+            raise Problem(403 if isinstance(error, PeerRefused) else 404, str(error)) from None
         if kind not in _TYPES:
-            return api.problem(404, f"there is no kind {kind[:20]!a} of files; these are: {', '.join(_TYPES)}")
+            raise Problem(404, f"there is no kind {kind[:20]!a} of files; these are: {', '.join(_TYPES)}")
         if name not in self._makings and len(self._makings) >= limits.RECORDINGS_WAITING:
-            return api.problem(429, "files of other recordings are being made; ask again later")
+            raise Problem(429, "files of other recordings are being made; ask again later")
         self._idle.cancel()
         making = self._makings.setdefault(name, _Making())
         making.task = making.task or start_task(self._make(making, recording, kind), f"make {name}")
         making.users += 1
-        if guard is not None:
+        if (guard := guard_of(request)) is not None:
             guard.stream(lambda: None)  # it may take minutes
         response = web.StreamResponse(headers={"Content-Type": _TYPES[kind]})
         response.force_close()  # its guard expects no further request
-        dress(response)
         try:
             told = await self._follow(request, response, making, making.task)
             if told is not None and "error" in told:
-                return api.problem(502, told["error"], (("Connection", "close"),))
+                raise Problem(502, told["error"])
             if told is not None:
                 await _send(request, response, self._path(recording, kind))
         except (OSError, TimeoutError):  # the client has gone, or takes nothing

@@ -21,17 +21,17 @@ from aiohttp import web
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.ros.types.codec import codec_for
-from rmpa.web import api, limits
-from rmpa.web.clients.connection import tune
-from rmpa.web.monitor.messages import compressed_picture, raw_picture
+from rmpa.web import limits
+from rmpa.web.hub.connection import tune
+from rmpa.web.pictures import compressed_picture, pillow, raw_picture
+from rmpa.web.server.access import Problem, guard_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.topics import ReceivedMessage
-    from rmpa.web.server.access import GuardedConnection
 
 _log = logging.getLogger(__name__)
 # Those that pages of other sites may show with the token in the URL.
@@ -132,24 +132,15 @@ def encode(kind: MessageType, payload: memoryview, wish: Wish) -> tuple[str, byt
         wanted = wish.width or round(wish.height * width / height), wish.height or round(wish.width * height / width)
         size = tuple(min(max(1, each), limits.PICTURE_SIDE_MAX) for each in wanted)
         # Whole pixels are averaged first: a sixth of the time.
-        image = image.resize(size, _pillow().Resampling.BILINEAR, reducing_gap=1.0)
+        image = image.resize(size, pillow().Resampling.BILINEAR, reducing_gap=1.0)
     out = io.BytesIO()
     image.save(out, "JPEG", quality=wish.quality or _QUALITY)
     return "image/jpeg", out.getvalue()
 
 
-def _pillow() -> Any:
-    try:
-        from PIL import Image  # noqa: PLC0415 - 30 ms and 10 MB, of the extra "web"
-    except ImportError:
-        raise RmpaError("raw images need Pillow, which is missing; pip install rmpa[web]") from None
-    return Image
-
-
 def _opened(values: Mapping[str, Any]) -> Any:
-    pillow = _pillow()
     try:
-        image = pillow.open(io.BytesIO(values["data"]), formats=("JPEG", "PNG"))
+        image = pillow().open(io.BytesIO(values["data"]), formats=("JPEG", "PNG"))
         _check_size(*image.size)
         return image.convert("RGB")
     except (OSError, ValueError, SyntaxError) as error:
@@ -164,10 +155,10 @@ def _image(values: Mapping[str, Any]) -> Any:
     data = values["data"]
     if not mode:
         made = raw_picture(width, height, encoding, step, data)
-        return _pillow().frombytes("L", (made.width, made.height), bytes(made.data))
+        return pillow().frombytes("L", (made.width, made.height), bytes(made.data))
     if width <= 0 or height <= 0 or step < width * size or len(data) < step * height:
         raise RemoteProtocolError(f"{len(data)} bytes are no image of {width} x {height} {encoding}")
-    return _pillow().frombuffer(mode, (width, height), data, "raw", raw, step, 1)
+    return pillow().frombuffer(mode, (width, height), data, "raw", raw, step, 1)
 
 
 def _check_size(width: int, height: int) -> None:
@@ -250,7 +241,6 @@ class VideoStreams:
         self._hub = hub
         self._cameras: dict[tuple[str, Wish], _Camera] = {}
         self._encoders = asyncio.Semaphore(limits.ENCODERS)
-        self._clients = 0
         # Of streams under way.
         self._transports: set[asyncio.Transport] = set()
 
@@ -259,25 +249,21 @@ class VideoStreams:
         for transport in [*self._transports]:
             transport.abort()
 
-    async def respond(
-        self, request: web.Request, guard: GuardedConnection | None, dress: Callable[[web.StreamResponse], None]
-    ) -> web.StreamResponse:
-        """A response to a request for pictures.
+    async def respond(self, request: web.Request) -> web.StreamResponse:
+        """A response to a request of one of ``PICTURES``.
 
-        Args:
-            request: Of one of ``PICTURES``.
-            guard: What guards its connection.
-            dress: Gives a response the headers that all have.
+        Raises:
+            Problem: There are no pictures, or too many streams.
         """
         await self._hub.settled(limits.SETTLE)
         try:
             wish = Wish.of(request.query)
             topic = self._topic(wish)
         except RmpaError as error:
-            return _problem(404 if error.code == "unknown-name" else 400, error)
-        if self._clients >= limits.STREAMS_MAX:
-            return _problem(429, RmpaError(f"{self._clients} streams are open, which is the limit; close some"))
-        self._clients += 1
+            raise Problem(404 if error.code == "unknown-name" else 400, str(error)) from None
+        clients = sum(each.users for each in self._cameras.values())
+        if clients >= limits.STREAMS_MAX:
+            raise Problem(429, f"{clients} streams are open, which is the limit; close some")
         key = topic, wish._replace(topic="", type="")
         try:
             camera = self._cameras.get(key)
@@ -285,20 +271,16 @@ class VideoStreams:
                 camera = self._cameras[key] = _Camera(self._hub, topic, wish, self._encoders)
             camera.users += 1
             try:
-                return await self._serve(request, camera, guard, dress)
+                return await self._serve(request, camera)
             finally:
                 camera.users -= 1
                 if not camera.users:
                     camera.close()
                     del self._cameras[key]
         except RmpaError as error:
-            response = _problem(403 if isinstance(error, PeerRefused) else 415, error)
-            response.force_close()  # its guard expects no further request
-            return response
+            raise Problem(403 if isinstance(error, PeerRefused) else 415, str(error)) from None
         except ConnectionError:
-            return _problem(504, RmpaError("the client has gone"))
-        finally:
-            self._clients -= 1
+            raise Problem(504, "the client has gone") from None
 
     def _topic(self, wish: Wish) -> str:
         """The topic that is shown: the compressed one beside a raw one, where that is wanted or as good."""
@@ -314,17 +296,11 @@ class VideoStreams:
             raise RemoteProtocolError(f"{wish.topic} has the type {known.types[0]}, which is not an image")
         return wish.topic
 
-    async def _serve(
-        self,
-        request: web.Request,
-        camera: _Camera,
-        guard: GuardedConnection | None,
-        dress: Callable[[web.StreamResponse], None],
-    ) -> web.StreamResponse:
+    async def _serve(self, request: web.Request, camera: _Camera) -> web.StreamResponse:
         transport, streams = request.transport, request.path == "/stream"
         if transport is None:
             raise ConnectionResetError
-        if streams and guard is not None:
+        if streams and (guard := guard_of(request)) is not None:
             guard.stream(camera.wake)
         try:
             async with asyncio.timeout(limits.PICTURE_WAIT):
@@ -332,13 +308,11 @@ class VideoStreams:
         except TimeoutError:
             first = None
         if not streams and first is None:
-            error = RmpaError(f"no picture came within {limits.PICTURE_WAIT:g} s: does its publisher run?")
-            return _problem(504, error)
+            raise Problem(504, f"no picture came within {limits.PICTURE_WAIT:g} s: does its publisher run?")
         if first is not None and not streams:
             return web.Response(body=first.data, headers=_headers(first))
         response = web.StreamResponse(headers={"Content-Type": f"multipart/x-mixed-replace;boundary={_BOUNDARY}"})
         response.force_close()
-        dress(response)
         await response.prepare(request)
         if request.method != "HEAD":
             tune(transport, limits.STREAM_UNSENT)
@@ -392,8 +366,3 @@ def _headers(picture: Encoded) -> dict[str, str]:
 def _html(title: str, body: str) -> web.Response:
     text = _PAGE.format(title=title, body=body)
     return web.Response(body=text.encode(), headers={"Content-Type": "text/html; charset=utf-8"})
-
-
-def _problem(status: int, error: RmpaError) -> web.Response:
-    made = api.problem(status, str(error))
-    return web.Response(status=status, body=made.body, headers={"Content-Type": made.content_type})

@@ -115,10 +115,9 @@ export function useAgain(on, period, key, ask) {
 export function useAnswer(connection, what, args, period = 0, key = "") {
   const [state, set] = useState({});
   useAgain(connection.phase === "open", period, JSON.stringify([what, args, key]), (wanted) =>
-    connection.ask(what, args).then(
-      (value) => wanted() && set({ value, last: value }),
-      (failure) => wanted() && set(({ last }) => ({ failure, last })),
-    ),
+    connection
+      .told(what, args)
+      .then((told) => wanted() && set(({ last }) => ({ last: told.failure ? last : told.value, ...told }))),
   );
   return state;
 }

@@ -261,6 +261,13 @@ export class Connection {
     });
   }
 
+  // The answer as `{ value }`, or `{ failure }`.
+  told = (what, args) =>
+    this.ask(what, args).then(
+      (value) => ({ value }),
+      (failure) => ({ failure }),
+    );
+
   // Shows who has the stick of a topic, takes it, takes it over, leaves it, or stops the robot.
   orderStick(topic, want, type) {
     this.driven = topic;

@@ -101,17 +101,16 @@ function Output({ connection, state: { agent }, one, close }) {
   const after = useRef({}); // by the node that writes
   const box = useRef();
   useAgain(connection.phase === "open", 1, one.name, (still) =>
-    connection.ask("launch", { do: "log", name: one.title, module, after: after.current, lines: 200 }).then(
-      ({ logs }) => {
+    connection
+      .told("launch", { do: "log", name: one.title, module, after: after.current, lines: 200 })
+      .then(({ value, failure }) => {
         if (!still()) return;
-        const fresh = logs.flatMap((each) => {
+        const fresh = (value?.logs || []).flatMap((each) => {
           after.current[each.source] = each.next;
           return each.lines.map((line) => (each.source ? `${each.source}: ${line}` : line));
         });
-        set((before) => ({ lines: fresh.length ? [...before.lines, ...fresh].slice(-KEPT) : before.lines }));
-      },
-      (failure) => still() && set((before) => ({ ...before, failure })),
-    ),
+        set(({ lines }) => ({ failure, lines: fresh.length ? [...lines, ...fresh].slice(-KEPT) : lines }));
+      }),
   );
   useEffect(() => {
     if (box.current) box.current.scrollTop = box.current.scrollHeight;

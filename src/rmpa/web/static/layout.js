@@ -10,10 +10,10 @@ const SHAPE = 8; // rows to a column: boxes are wide, and so are screens
 const SWEEPS = 8;
 const ALIGNS = 6;
 
-// What each of `ids` has by pairs of it and something.
-function lists(ids, pairs) {
+// What each of `ids` has, by the pair of it and something that `of` makes of each item.
+function lists(ids, items, of) {
   const made = new Map(ids.map((id) => [id, []]));
-  for (const [id, each] of pairs) made.get(id).push(each);
+  for (const [id, each] of items.map(of)) made.get(id).push(each);
   return made;
 }
 const mean = (list) => list.reduce((sum, each) => sum + each, 0) / list.length;
@@ -21,14 +21,8 @@ const ends = ({ from, to, turned }) => (turned ? [to, from] : [from, to]);
 
 // Edges that close a cycle are turned: a depth-first walk, from those that have the most outputs and no input.
 function acyclic(ids, edges) {
-  const out = lists(
-    ids,
-    edges.map((edge) => [edge.from, edge]),
-  );
-  const inputs = lists(
-    ids,
-    edges.map(({ from, to }) => [to, from]),
-  );
+  const out = lists(ids, edges, (edge) => [edge.from, edge]);
+  const inputs = lists(ids, edges, ({ from, to }) => [to, from]);
   const degree = (id) => inputs.get(id).length - out.get(id).length;
   const open = new Map();
   const visit = (id) => {
@@ -43,11 +37,8 @@ function acyclic(ids, edges) {
 
 // The column of each vertex: the longest way to it; what only sends stands directly before what it sends to.
 function ranks(ids, edges) {
-  const after = lists(ids, edges.map(ends)),
-    before = lists(
-      ids,
-      edges.map((edge) => ends(edge).reverse()),
-    );
+  const after = lists(ids, edges, ends);
+  const before = lists(ids, edges, (edge) => ends(edge).reverse());
   const rank = new Map();
   const of = (id) => {
     if (!rank.has(id)) rank.set(id, Math.max(-1, ...before.get(id).map(of)) + 1);
@@ -62,14 +53,8 @@ function ranks(ids, edges) {
 // Where many cycles make long chains, each vertex stands as near to the sources as it can instead, and the edges that
 // lead back are turned.
 function nearest(ids, edges) {
-  const after = lists(
-      ids,
-      edges.map(({ from, to }) => [from, to]),
-    ),
-    before = lists(
-      ids,
-      edges.map(({ from, to }) => [to, from]),
-    );
+  const after = lists(ids, edges, ({ from, to }) => [from, to]);
+  const before = lists(ids, edges, ({ from, to }) => [to, from]);
   const rank = new Map();
   const spread = (queue) => {
     for (const id of queue) rank.set(id, 0);

@@ -22,10 +22,7 @@ export function useLog(connection, wanted, held = false) {
     set({ lines: [], problems: [], waits: true });
   }, [key]);
   useAgain(!held && connection.phase === "open", PERIOD, key, async (still) => {
-    const told = await connection.ask("log", { ...wanted, after: after.current }).then(
-      (value) => ({ value }),
-      (failure) => ({ failure }),
-    );
+    const told = await connection.told("log", { ...wanted, after: after.current });
     if (still()) set((before) => merged(before, told, after.current));
   });
   return state;

@@ -1,30 +1,21 @@
 // Dark or light: as the system says, until the user chooses.
 
-const KEY = "rmpa.theme";
-const system = () => (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
-function stored() {
-  try {
-    return localStorage.getItem(KEY);
-  } catch {
-    return null;
-  }
-}
+import { store, stored } from "./storage.js";
 
-export const theme = () => document.documentElement.dataset.theme || stored() || system();
+const KEY = "rmpa.theme"; // in the browser: { chosen }
+const system = () => (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark");
+
+export const theme = () => document.documentElement.dataset.theme || system();
 
 export function applyTheme() {
-  const chosen = stored();
+  const { chosen } = stored(KEY);
   if (chosen === "dark" || chosen === "light") document.documentElement.dataset.theme = chosen;
 }
 
 export function nextTheme() {
-  const next = theme() === "dark" ? "light" : "dark";
-  document.documentElement.dataset.theme = next;
-  try {
-    localStorage.setItem(KEY, next);
-  } catch {
-    /* a private window: the choice lasts as long as the page */
-  }
+  const chosen = theme() === "dark" ? "light" : "dark";
+  document.documentElement.dataset.theme = chosen;
+  store(KEY, { chosen });
 }
 
 // The value of a colour, or of another property of the style.

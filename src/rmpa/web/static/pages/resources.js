@@ -144,7 +144,7 @@ export function ResourcePage({ name, state, connection }) {
   const may = connection.may("control");
   const choose =
     may && ((what, choice) => connection.ask(what, { ...whose, choice }).then(() => setFailure(null), setFailure));
-  const set = may && ((parameter, value) => connection.ask("configure", { ...whose, name: parameter, value }));
+  const set = may && ((parameter, value) => connection.told("configure", { ...whose, name: parameter, value }));
   const { attributes = [], profiles = [], nodes = [] } = descriptor;
   const hands = section(decision, "by_hand");
   const alarms = entries(state, "alarms").filter(([, each]) => each.resource === name);
@@ -236,10 +236,7 @@ function Setting({ value, about, set }) {
   const save = (draft) => {
     const typed = setting(draft, about);
     if (typed.error) return Promise.resolve({ failure: typed });
-    return set(typed.value).then(
-      (answer) => ({ said: answer.text }),
-      (failure) => ({ failure }),
-    );
+    return set(typed.value).then(({ value, failure }) => (failure ? { failure } : { said: value.text }));
   };
   const choices = about.choices?.length ? about.choices.map(String) : about.type === "bool" ? ["true", "false"] : null;
   return html`<${Editable} label=${about.name} ...${{ shown, save, choices }} begin=${written ?? ""} />`;

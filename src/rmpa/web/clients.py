@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-import secrets
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -18,24 +17,22 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.runtime.tasks import start_task
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import FrameSocket
 from rmpa.web.foxglove import limits as foxglove_limits
 from rmpa.web.foxglove.channels import ChannelTable
 from rmpa.web.foxglove.protocol import SUBPROTOCOLS
 from rmpa.web.foxglove.session import FoxgloveSession
+from rmpa.web.hub.frame_writer import FrameSocket
 from rmpa.web.monitor.messages import SUBPROTOCOL
 from rmpa.web.monitor.session import MonitorSession
-from rmpa.web.rosbridge.protocol import PublishFrames
 from rmpa.web.rosbridge.session import RosbridgeSession
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.web.clients.connection import ClientConnection, Session
+    from rmpa.web.hub.connection import ClientConnection, Session
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.monitor.monitor import Monitor
-    from rmpa.web.server.access import GuardedConnection
 
 
 _log = logging.getLogger(__name__)
@@ -79,7 +76,6 @@ class WebSocketClients:
         hub: The hub.
         name: The server's name, for users.
         rights: What clients may do.
-        priority: The priority of a topic's messages: higher ones go first.
         monitor: Serves the pages at ``MONITOR_PATH``; without it there are none.
         others: Further protocols.
     """
@@ -89,7 +85,6 @@ class WebSocketClients:
         hub: Hub,
         name: str,
         rights: Rights,
-        priority: Callable[[str], int] = lambda _: 0,
         monitor: Monitor | None = None,
         others: Sequence[type[Session]] = (),
     ) -> None:
@@ -99,14 +94,13 @@ class WebSocketClients:
         self._monitor = monitor
         self._hub = hub
         self._rights = rights
-        self._priority = priority
-        self._channels = ChannelTable(hub, services=rights.control)
-        foxglove = functools.partial(FoxgloveSession, table=self._channels, server=(name, secrets.token_hex(8)))
+        self._channels = ChannelTable(hub, name, services=rights.control)
+        foxglove = functools.partial(FoxgloveSession, table=self._channels)
         # By the subprotocol that a client offers; empty for none.
-        self._protocols: dict[str, Callable[[Hub, Rights, Callable[[str], int], str], Session]] = {
+        self._protocols: dict[str, Callable[[Hub, Rights, str], Session]] = {
             **{name: other for other in others for name in other.subprotocols},
             **dict.fromkeys(SUBPROTOCOLS, foxglove),
-            "": functools.partial(RosbridgeSession, encoder=PublishFrames()),
+            "": RosbridgeSession,
         }
         self._kinds = *PROTOCOLS, *(other.kind for other in others)
         self._open: dict[Session, FrameSocket] = {}
@@ -131,39 +125,32 @@ class WebSocketClients:
             )
         return found
 
-    async def handle(self, request: web.Request, guard: GuardedConnection | None = None) -> web.StreamResponse:
-        """Serve one client until it has gone.
-
-        Args:
-            request: Asks for the WebSocket.
-            guard: What guards its connection; ``None``: nothing does.
-        """
+    async def handle(self, request: web.Request) -> web.StreamResponse:
+        """Serve one client, whose request asks for the WebSocket, until it has gone."""
         lines = request.headers.getall("Sec-WebSocket-Protocol", ())
         offered = [name.strip() for name in ",".join(lines).split(",") if name.strip()]
         address = request.remote or "?"
         if request.path == MONITOR_PATH:
             if self._monitor is None or SUBPROTOCOL not in offered:
                 return self._refuse_protocol(address, f"pages speak {SUBPROTOCOL} here; see /rosbridge")
-            await self._monitor.mesh.first()
-            page = MonitorSession(self._hub, self._rights, self._priority, address, self._monitor)
-            return await self._serve(request, guard, page, page.frame_max)
+            await self._monitor.first()
+            page = MonitorSession(self._hub, self._rights, address, self._monitor)
+            return await self._serve(request, page, page.frame_max)
         chosen = next((name for name in offered if name in self._protocols), None if offered else "")
         if chosen is None:
             spoken = f"{', '.join(filter(None, self._protocols))}, and rosbridge without a subprotocol"
             return self._refuse_protocol(address, f"{', '.join(offered)[:80]!a} is not spoken here: {spoken} are")
         await self._hub.settled(limits.SETTLE)
-        session = self._protocols[chosen](self._hub, self._rights, self._priority, address)
+        session = self._protocols[chosen](self._hub, self._rights, address)
         # Only a client that sends data has a use for large messages: aiohttp keeps what it has gathered to the end.
         most = session.frame_max if self._rights.control else foxglove_limits.TEXT_MAX
-        return await self._serve(request, guard, session, most)
+        return await self._serve(request, session, most)
 
     def _refuse_protocol(self, address: str, text: str) -> web.Response:
         self.refuse(address, "handshake", text)
         return web.Response(status=400, text=f"{text}\n")
 
-    async def _serve(
-        self, request: web.Request, guard: GuardedConnection | None, session: Session, most: int
-    ) -> web.StreamResponse:
+    async def _serve(self, request: web.Request, session: Session, most: int) -> web.StreamResponse:
         response = FrameSocket(
             protocols=(*filter(None, self._protocols), SUBPROTOCOL),
             autoping=False,
@@ -174,7 +161,7 @@ class WebSocketClients:
         self._open[session] = response
         try:
             refused = functools.partial(self._refuse_client, session)
-            await session.connection.run(request, response, guard, refused)
+            await session.connection.run(request, response, refused)
         except PeerRefused as error:
             self.refuse(session.address, "clients", str(error))
             return web.Response(status=503, text=f"{error}\n")

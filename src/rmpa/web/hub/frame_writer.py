@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _FIN: Final = 0x80
-_MASKED: Final = 0x80
-_MASK_BYTES: Final = 4
 _SHORT: Final = struct.Struct("!BB")
 _MIDDLE: Final = struct.Struct("!BBH")
 _LONG: Final = struct.Struct("!BBQ")
@@ -52,33 +50,9 @@ class Opcode(IntEnum):
 OutFrame: TypeAlias = tuple[Opcode, Sequence["Payload"]]
 
 
-class MaskCheck:
-    """Finds a frame of a client that is not masked, which the library takes (RFC 6455, section 5.1)."""
-
-    def __init__(self) -> None:
-        self._header = bytearray()
-        # Bytes of the frame's payload that are still to come, its mask included.
-        self._payload = 0
-
-    def passes(self, data: bytes) -> bool:
-        """Take the next bytes of the connection; return whether all frames that begin in them are masked."""
-        at = 0
-        while at < len(data):
-            if self._payload:
-                taken = min(self._payload, len(data) - at)
-                self._payload -= taken
-                at += taken
-                continue
-            self._header.append(data[at])
-            at += 1
-            length = self._header[1] & ~_MASKED if len(self._header) > 1 else 0
-            if len(self._header) == 2 and not self._header[1] & _MASKED:
-                return False
-            extra = {126: 2, 127: 8}.get(length, 0)
-            if len(self._header) == 2 + extra:
-                self._payload = _MASK_BYTES + (int.from_bytes(self._header[2:], "big") if extra else length)
-                self._header.clear()
-        return True
+def size_of(frame: OutFrame) -> int:
+    """Bytes of a frame's payload."""
+    return sum(map(len, frame[1]))
 
 
 def frame_header(opcode: Opcode, size: int) -> bytes:

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.web import limits
-from rmpa.web.clients.connection import CommandAge, MessageArrival, Session
-from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, MaskCheck, Opcode, frame_header
+from rmpa.web.hub.connection import CommandAge, Session
+from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, frame_header
 from rmpa.web.hub.node_link import READ_ONLY
+from rmpa.web.server.access import FrameCheck
 from tests.waiting import DEADLINE, until
 
 # 4 MB, in which a part that is left out or twice would show.
@@ -160,8 +160,8 @@ def _masked(size: int) -> bytes:
 def test_a_frame_without_a_mask_is_found_wherever_it_begins(step: int) -> None:
     data = b"".join(map(_masked, _SIZES))
     for unmasked in (b"", b"\x81\x00", b"\x81\x7e"):
-        check, whole = MaskCheck(), data + unmasked
-        passed = [check.passes(whole[at : at + step]) for at in range(0, len(whole), step)]
+        check, whole = FrameCheck(), data + unmasked
+        passed = [check.passes(whole[at : at + step], 0.0) for at in range(0, len(whole), step)]
         assert all(passed) is (unmasked == b"")
 
 
@@ -326,7 +326,7 @@ async def forever() -> None:
 
 async def watched(transport: Transport) -> None:
     hub: Any = None
-    connection = Silent(hub, READ_ONLY, lambda _: 0, "here").connection
+    connection = Silent(hub, READ_ONLY, "here").connection
     played: Any = transport
     connection._transport = played
     connection._out = FrameWriter(played, forever)
@@ -351,30 +351,20 @@ async def test_a_large_message_that_goes_on_is_a_sign_of_life(monkeypatch: pytes
     assert transport.written == b""
 
 
-LONG = limits.MESSAGE_TIMEOUT
-
-
-def test_a_message_whose_fragments_never_end_takes_too_long_whatever_comes_between_them() -> None:
-    arrival, received = MessageArrival(), 0
-    for now in range(0, int(LONG), 10):
-        assert not arrival.takes_too_long(received, now)
-        received += 7  # a fragment
-        received += 6  # a pong
-        arrival.control_frame(0)
-    assert not arrival.takes_too_long(received, LONG + 9)
-    assert arrival.takes_too_long(received, LONG + 10)
-
-
-def test_messages_that_end_and_pongs_do_not() -> None:
-    arrival, received = MessageArrival(), 0
-    for now in range(0, int(5 * LONG), 10):
-        received += 100
-        assert not arrival.takes_too_long(received, now)  # it is on its way
-        arrival.message_ended(received)
-    for now in range(int(5 * LONG), int(10 * LONG), 10):
-        received += 6 + 125
-        arrival.control_frame(125)
-        assert not arrival.takes_too_long(received, now)
+def test_a_message_arrives_until_its_last_fragment_whatever_comes_between_them() -> None:
+    check = FrameCheck()
+    fragment, ping, last = b"\x01\x82maskab", b"\x89\x84maskping", b"\x80\x80mask"
+    for now, data, since in (
+        (1.0, fragment[:1], 1.0),
+        (2.0, fragment[1:], 1.0),
+        (3.0, ping + b"\x00" + fragment[1:], 1.0),
+        (4.0, last[:-1], 1.0),
+        (5.0, last[-1:], None),
+        (6.0, ping, None),  # no message
+        (7.0, last + fragment, 7.0),
+    ):
+        assert check.passes(data, now)
+        assert check.since == since
 
 
 def test_a_frame_is_younger_than_the_last_ping_that_was_answered_before_it() -> None:

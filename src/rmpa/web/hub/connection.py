@@ -23,17 +23,18 @@ from aiohttp import WebSocketError, WSCloseCode, WSMsgType
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB, MIB
-from rmpa.runtime.tasks import end_tasks, start_task
+from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
-from rmpa.web.clients.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame
+from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame, size_of
 from rmpa.web.hub.hub import HubClient
+from rmpa.web.server.access import guard_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from aiohttp import web
 
-    from rmpa.web.clients.frame_writer import FrameSocket
+    from rmpa.web.hub.frame_writer import FrameSocket
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # Pings without an answer, behind which no further one is sent: they wait as the client's frames do.
 _UNANSWERED_MAX: Final = 8
-# Bytes of a client's control frame before its payload: two, and the mask.
-_CONTROL_HEADER: Final = 6
 # Bytes that an entry of the queue takes beside its payload.
 _OVERHEAD: Final = 128
 # Entries that are written before other tasks have their turn.
@@ -51,7 +50,7 @@ _TURN: Final = 16
 # Looks without a sign of life, each after half of ``limits.PING_INTERVAL``.
 _SILENT_LOOKS: Final = 3
 # Makes the frames of an entry of the queue, when they can be written.
-_Entry: TypeAlias = "Callable[[float], Iterable[OutFrame]]"
+_Entry: TypeAlias = "Callable[[], Iterable[OutFrame]]"
 # Pings within the age that a client's commands may have.
 _AGE_PINGS: Final = 4
 
@@ -92,7 +91,6 @@ class Session(HubClient):
     Args:
         hub: The hub.
         rights: What the client may do.
-        priority: The priority of a topic's messages: higher ones go first.
         address: The client's, for logs.
     """
 
@@ -105,11 +103,11 @@ class Session(HubClient):
     # Whether the protocol itself says how old a command is.
     dates_commands = False
 
-    def __init__(self, hub: Hub, rights: Rights, priority: Callable[[str], int], address: str) -> None:
+    def __init__(self, hub: Hub, rights: Rights, address: str) -> None:
         super().__init__(hub, f"{self.kind} {address}", rights)
         self.address = address
         self._late_told = -limits.DROPS_SHOWN
-        self.connection = ClientConnection(self, priority)
+        self.connection = ClientConnection(self)
 
     def late(self) -> str:
         """Why a command that comes now may be too old, by the pings that the client has answered."""
@@ -152,50 +150,8 @@ class ClientStream:
     topic: str
 
     @abstractmethod
-    def frames(self, message: ReceivedMessage, now: float) -> Iterable[OutFrame]:
+    def frames(self, message: ReceivedMessage) -> Iterable[OutFrame]:
         """The frames of a message; called when the connection can take them."""
-
-
-class MessageArrival:
-    """Finds a message that never ends. A byte too few may be counted for it, and never one too many.
-
-    The library gathers the bytes and fragments of a message (RFC 6455, section 5.4) and passes only whole ones on.
-    What a connection received beyond the whole ones belongs to a message that is not whole yet.
-    """
-
-    def __init__(self) -> None:
-        self._accounted = 0
-        self._began: float | None = None
-
-    def message_ended(self, received: int) -> None:
-        """A message is whole.
-
-        Args:
-            received: Bytes of the connection so far.
-        """
-        self._accounted = received
-        self._began = None
-
-    def control_frame(self, size: int) -> None:
-        """A ping or pong is whole, which may come between the fragments of a message.
-
-        Args:
-            size: Bytes of its payload.
-        """
-        self._accounted += _CONTROL_HEADER + size
-
-    def takes_too_long(self, received: int, now: float) -> bool:
-        """Whether a message has been arriving for ``limits.MESSAGE_TIMEOUT``; to be asked every few seconds.
-
-        Args:
-            received: Bytes of the connection so far.
-            now: Seconds of a clock that never goes back.
-        """
-        if received <= self._accounted:
-            self._began = None
-        elif self._began is None:
-            self._began = now
-        return self._began is not None and now - self._began >= limits.MESSAGE_TIMEOUT
 
 
 class CommandAge:
@@ -241,19 +197,16 @@ class ClientConnection:
 
     Args:
         session: Its protocol.
-        priority: The priority of a topic's messages: higher ones go first.
     """
 
     # More than 12 fields: the socket, the two timers, and what is known of both directions.
-    def __init__(self, session: Session, priority: Callable[[str], int]) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._priority = priority
         self.queue: FairQueue[_Entry] = FairQueue()
         # Messages and answers that were written.
         self.sent = 0
         self._heard = 0
         self._guard: GuardedConnection | None = None
-        self._arrival = MessageArrival()
         self._age: CommandAge | None = None
         self._wake = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
@@ -268,7 +221,7 @@ class ClientConnection:
     def push(self, *frames: OutFrame) -> None:
         """Queue frames that are not dropped."""
         for frame in frames:
-            self._queue(None, partial(_as_it_is, frame), sum(map(len, frame[1])))
+            self._queue(None, partial(tuple, (frame,)), size_of(frame))
 
     def push_message(self, stream: ClientStream, message: ReceivedMessage) -> None:
         """Queue a message of a subscription."""
@@ -318,16 +271,10 @@ class ClientConnection:
         """Bytes that wait, here and behind the queue."""
         return self.queue.bytes + self._waiting
 
-    @property
-    def _received(self) -> int:
-        """Bytes that the client has sent; 0 where they are not counted."""
-        return self._guard.received if self._guard is not None else 0
-
     async def run(
         self,
         request: web.Request,
         socket_: FrameSocket,
-        guard: GuardedConnection | None,
         refused: Callable[[str, str], None],
     ) -> None:
         """Serve the client until it has gone.
@@ -335,7 +282,6 @@ class ClientConnection:
         Args:
             request: Asks for the WebSocket.
             socket_: Not prepared yet.
-            guard: What guards the connection and counts what the client has sent; ``None``: nothing does.
             refused: ``(reason, text)``: called if the client is disconnected for one of ``clients.CLIENT_REFUSALS``.
 
         Raises:
@@ -344,13 +290,12 @@ class ClientConnection:
         self._refused = refused
         session = self._session
         session.hub.connect(session)
-        tasks: list[asyncio.Task[None]] = []
+        tasks = OwnedTasks()
         try:
             writer = await socket_.prepare(request)
-            if guard is not None:
-                guard.upgrade(self.unmasked)
-                self._guard = guard
-            self._arrival.message_ended(self._received)
+            self._guard = guard_of(request)
+            if self._guard is not None:
+                self._guard.upgrade(self.unmasked)
             self._transport = request.transport
             if self._transport is None:
                 return  # it went during the handshake
@@ -358,12 +303,11 @@ class ClientConnection:
             self._out = FrameWriter(self._transport, writer.drain)
             socket_.before_close = self._out.hand_over
             session.opened()
-            works = [("write to", self._write(socket_, self._out)), ("watch", self._watch())]
+            tasks.start(self._write(socket_, self._out), f"write to {session.name}")
+            tasks.start(self._watch(), f"watch {session.name}")
             if session.rights.command_age and not session.dates_commands:
                 self._age = CommandAge(self.now())
-                works.append(("ask the age of", self._ask_age(self._age)))
-            for name, work in works:
-                tasks.append(start_task(work, f"{name} {session.name}"))
+                tasks.start(self._ask_age(self._age), f"ask the age of {session.name}")
             await self._read(socket_)
         finally:
             try:
@@ -375,7 +319,7 @@ class ClientConnection:
                 session.hub.disconnect(session)
                 if self._out is not None:
                     self._out.close()
-                await end_tasks(*tasks)
+                await tasks.close()
 
     async def _read(self, socket_: FrameSocket) -> None:
         async for message in socket_:
@@ -384,10 +328,6 @@ class ClientConnection:
                 await asyncio.sleep(0)  # frames that have arrived already do not suspend this task
             if message.type == WSMsgType.PONG and self._age is not None:
                 self._age.pong(bytes(message.data))
-            if message.type in (WSMsgType.PING, WSMsgType.PONG):
-                self._arrival.control_frame(len(message.data))
-            else:
-                self._arrival.message_ended(self._received)
             if message.type == WSMsgType.ERROR:
                 self._failed(message.data)
             if self._gone:
@@ -424,8 +364,9 @@ class ClientConnection:
         silent, heard, waiting = 0, (-1, 0), 0
         while silent < _SILENT_LOOKS:
             await asyncio.sleep(limits.PING_INTERVAL / 2)
-            now, received = self._waiting, self._received
-            if self._arrival.takes_too_long(received, self.now()):
+            now, guard = self._waiting, self._guard
+            received, since = (guard.received, guard.frames.since) if guard is not None else (0, None)
+            if since is not None and self.now() - since >= limits.MESSAGE_TIMEOUT:
                 self.end(WSCloseCode.POLICY_VIOLATION, "a message did not end in time", "message")
                 return
             alive = (self._heard, received) != heard or (waiting and now != waiting)
@@ -450,15 +391,14 @@ class ClientConnection:
                 if self._close is not None:
                     await socket_.close(code=self._close[0], message=self._close[1].encode()[:120])
                     return
-                now = self.now()
-                entry = self.queue.pop(now)
+                entry = self.queue.pop(self.now())
                 if entry is None:
                     self._wake.clear()
                     with contextlib.suppress(TimeoutError):
                         async with asyncio.timeout_at(self.queue.due):
                             await self._wake.wait()
                     continue
-                for opcode, parts in entry(now):
+                for opcode, parts in entry():
                     self._send(opcode, parts)
                 self._tell_drops()
                 await out.drain()
@@ -493,7 +433,7 @@ class ClientConnection:
     def _queue(self, stream: ClientStream | None, entry: _Entry, size: int) -> None:
         if self._gone:
             return
-        priority = self._priority(stream.topic) if stream else 0
+        priority = self._session.hub.priority(stream.topic) if stream else 0
         self.queue.push(stream, entry, size + _OVERHEAD, priority, self.now())
         if self.queue.overflow:
             _log.warning("! %s does not read its answers, and is disconnected [reader-slow]", self._session.name)
@@ -520,10 +460,6 @@ class ClientConnection:
     def _abort(self) -> None:
         if self._transport is not None:
             self._transport.abort()
-
-
-def _as_it_is(frame: OutFrame, _: float) -> tuple[OutFrame]:
-    return (frame,)
 
 
 def tune(transport: asyncio.Transport, unsent: int = 512 * KIB) -> None:

@@ -1,1 +1,0 @@
-"""WebSocket clients: rosbridge v2, the Foxglove WebSocket protocol and the pages, over the hub."""
