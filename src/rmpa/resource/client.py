@@ -208,7 +208,7 @@ class Demands(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
         self._clients: dict[str, ResourceClient] = {}
         # The topics of each resource whose descriptor has been received, in this graph: by the prefix that the
         # attributes of the output have; without one by an empty text.

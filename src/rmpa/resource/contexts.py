@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.adapter import HungError, call_function
 from rmpa.resource.declare import Context
+from rmpa.resource.functions import HungError, call_function
 from rmpa.resource.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from rmpa.resource.adapter import Adapter
@@ -50,28 +49,21 @@ class Contexts(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, adapter: Adapter) -> None:
-        resource = runtime.resource
-        self._runtime = runtime
+        super().__init__(runtime)
         self._values = values
         self._tasks = tasks
         self._adapter = adapter
-        self._known = resource.contexts
+        self._known = runtime.resource.contexts
         # Name of the present context; empty: none.
         self.current = ""
         # Name of the context chosen by hand; empty: the rules decide. May be set before ``start``.
         self.chosen = ""
         # When the present context began, monotonic seconds.
         self._since = -math.inf
-        self._rules = {
-            name: resource.expression(context.when, f"context {name} of {resource.name}")
-            for name, context in self._known.items()
-            if context.when
-        }
-        self._references = {reference for rule in self._rules.values() for reference in rule.references}
+        self._rules = {name: one.when for name, one in self._known.items() if one.when is not None}
         self._retry = 0.0
         # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
-        self._work = OwnedTasks()
         self._next_evaluation: float | None = None
         self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
         # True before ``start`` and after ``close``.
@@ -92,7 +84,7 @@ class Contexts(RuntimePart):
                 _log.warning("! %s: %s [resource-trouble]", node.name, error)
                 self.chosen = ""
         if self._rules:
-            self._values.listeners.append(self._changed)
+            self._values.on_change = self._values_changed
             self._evaluate(self._loop.time())
             self._timer.arm()
 
@@ -100,7 +92,7 @@ class Contexts(RuntimePart):
         """Stop the evaluation of rules; the present context stays."""
         self._closed = True
         self._timer.close()
-        await self._work.close()
+        await super().close()
 
     async def choose(self, name: str) -> None:
         """Choose a context by hand; an empty name lets the rules decide again.
@@ -136,9 +128,10 @@ class Contexts(RuntimePart):
         values = self._values.now()
         return next((name for name, rule in self._rules.items() if rule.holds(values)), "")
 
-    def _changed(self, references: set[str]) -> None:
+    def _values_changed(self, references: set[str]) -> None:
         """Evaluate the rules soon if one of them refers to what has changed."""
-        if references & self._references and self._next_evaluation is not None:
+        concerned = any(not references.isdisjoint(rule.references) for rule in self._rules.values())
+        if concerned and self._next_evaluation is not None:
             self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
             self._timer.arm()
 
@@ -157,13 +150,13 @@ class Contexts(RuntimePart):
                 self._retry = self._loop.time() + limits.CONTEXT_RETRY
 
     def _choice_received(self, message: Received) -> None:
-        self._work.start(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
+        async def choose() -> None:
+            try:
+                await self.choose(str(message.message.data))
+            except RmpaError as error:
+                self._adapter.refuse(message.caller_id, printable(str(error)))
 
-    async def _choose_by_topic(self, name: str, client: str) -> None:
-        try:
-            await self.choose(name)
-        except RmpaError as error:
-            self._adapter.refuse(client, printable(str(error)))
+        self._work.start(choose(), "choose context")
 
     async def _switch(self, name: str) -> None:
         """Switch to a context.

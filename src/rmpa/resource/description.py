@@ -37,8 +37,8 @@ from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource import limits
-from rmpa.resource.declaration import Role
-from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy
+from rmpa.resource.decision import OfferSource
+from rmpa.resource.declare import Binding, BindingKind, Measure, RestartPolicy, Role
 from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
 from rmpa.resource.resource import Resource
 from rmpa.runtime.programs import StartRule

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 from typing import TYPE_CHECKING, Final
 
@@ -11,20 +10,19 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaE
 from rmpa.resource.actuation import Actuation
 from rmpa.resource.adapter import Adapter
 from rmpa.resource.client import Demands
-from rmpa.resource.configuration import Reconfigure
 from rmpa.resource.contexts import Contexts
-from rmpa.resource.observing import Observing
+from rmpa.resource.functions import call_hook
+from rmpa.resource.measuring import Measuring
 from rmpa.resource.processes import Processes
+from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
-from rmpa.resource.sources import Sources
 from rmpa.resource.tasks import Tasks
 from rmpa.resource.values import ExpressionValues
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.accept import in_thread
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
@@ -76,13 +74,18 @@ class ResourceNode:
         self.runtime.close_outputs()
         self.processes = Processes(self.runtime, state.parent if state is not None else None)
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
-        self.values = ExpressionValues(self.runtime, resource.expressions())
+        self.values = ExpressionValues(self.runtime, self.processes)
         self.actuation = Actuation(self.runtime, self.processes)
-        stop = stop if stop is not None else asyncio.Event()
-        observing = Observing(self.runtime, self.values)
-        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, observing, stop)
-        self.adapter.processes = self.processes
-        self.processes.on_change = self.adapter.node_changed
+        measuring = Measuring(self.runtime, self.values)
+        self.adapter = Adapter(
+            self.runtime,
+            self.values,
+            self.tasks,
+            self.actuation,
+            self.processes,
+            measuring,
+            stop if stop is not None else asyncio.Event(),
+        )
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
@@ -90,10 +93,9 @@ class ResourceNode:
         self.parts: list[RuntimePart] = [
             self.processes,
             self.values,
-            Sources(self.runtime, self.values, self.processes),
             self.tasks,
             self.actuation,
-            observing,
+            measuring,
             self.adapter,
             self.contexts,
             self.configuration,
@@ -242,14 +244,9 @@ class ResourceNode:
         elif transition == "activate":
             runtime.open_outputs()
         why = ""
-        hook = self.resource.hooks.get(transition)
         try:
-            if inspect.iscoroutinefunction(hook):
-                await hook()
-            elif hook is not None:
-                outcome = await in_thread(hook, transition)
-                if outcome is not None:
-                    await outcome
+            if (hook := self.resource.hooks.get(transition)) is not None:
+                await call_hook(hook, transition)
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
             _log.warning("! %s: %s: %s [resource-trouble]", runtime.node.name, transition, why)

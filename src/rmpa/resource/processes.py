@@ -42,7 +42,7 @@ from rmpa.runtime.programs import (
     rotate_log,
     start_program,
 )
-from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -96,8 +96,8 @@ class Processes(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, directory: Path | None) -> None:
+        super().__init__(runtime)
         resource = runtime.resource
-        self._runtime = runtime
         self._record = directory / RUNS / f"{resource.name}.json" if directory is not None else None
         logs = directory / LOGS if directory is not None else None
         self._nodes: dict[str, _Supervised] = {}
@@ -110,7 +110,6 @@ class Processes(RuntimePart):
         self._wanted: set[str] = set()
         # Called when a wanted node has ended (true), and when it runs again (false), with a text for people.
         self.on_change: Callable[[ManagedNode, str, bool], None] = lambda _node, _text, _ended: None
-        self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
         self._complained = False
@@ -133,7 +132,7 @@ class Processes(RuntimePart):
         """End what was started here."""
         await asyncio.gather(*(node.down() for node in self._nodes.values()))
         await self.note(LifecycleState.FINALIZED)
-        await self._work.close()
+        await super().close()
 
     async def require(self, keys: Collection[str]) -> None:
         """Wait until exactly these nodes are up, of those that profiles name, and all that always run.

@@ -27,7 +27,7 @@ from rmpa.runtime.tasks import keep_task
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.resource.declare import Input, Parameter, Task
+    from rmpa.resource.declare import DeclaredTopic, Parameter, Task
     from rmpa.resource.quality import Value
     from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received
@@ -391,7 +391,7 @@ class Tasks(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, on_deactivate: Callable[[str], None]) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
         self._on_deactivate = on_deactivate
         self.gate = RunGate()
         self._runners: dict[str, AsyncTaskRunner | ThreadTaskRunner] = {}
@@ -424,6 +424,11 @@ class Tasks(RuntimePart):
                 self._slow[name] = self.report(problem) if problem and not before else problem
             elif before:
                 _log.info("= %s: task %s keeps up again", self._runtime.node.name, name)
+
+    async def start(self) -> None:
+        """Listen to the inputs on which tasks run."""
+        if any(task.on is not None for task in self._runtime.resource.tasks.values()):
+            self._runtime.listeners.append(self.heard)
 
     def activate(self) -> None:
         """Start all tasks."""
@@ -459,10 +464,10 @@ class Tasks(RuntimePart):
         """Let runs begin again, unless another change is under way."""
         self.gate.open(holder)
 
-    def received(self, item: Input, message: Received) -> None:
+    def heard(self, topic: DeclaredTopic, _raw: bytes, _now_ns: int, message: Received | None) -> None:
         """Queue a message for the tasks that run on its input."""
         for runner in self._runners.values():
-            if runner.task.on is item:
+            if runner.task.on is topic and message is not None:
                 runner.enqueue(message)
 
     def parameter_changed(self, parameter: Parameter) -> None:
