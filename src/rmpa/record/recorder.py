@@ -17,6 +17,7 @@ import msgspec
 from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, recording_id, request_keep
 from rmpa.client import (
     AgentClient,
+    AgentEvent,
     AgentLost,
     ContractBroken,
     NoteCleared,
@@ -29,7 +30,7 @@ from rmpa.client import (
     TopicGone,
     changes,
 )
-from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST
+from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST, RecordSettings
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches_any
 from rmpa.observe.control_client import ControlClient, choose_agent
@@ -43,6 +44,7 @@ from rmpa.record.format import (
     Event,
     ModuleRecord,
     RecordedSource,
+    SegmentWriter,
     event_bytes,
 )
 from rmpa.record.ring import RingThread
@@ -56,10 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from rmpa.client import AgentEvent
-    from rmpa.config.recording import RecordSettings
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.record.format import SegmentWriter
 
 _log = logging.getLogger(__name__)
 _SECOND: Final = 1_000_000_000

@@ -23,21 +23,18 @@ import msgspec
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare import BindingKind
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.declare import Binding, BindingKind, Parameter, ParameterValue
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
-from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.messages import MessageType, Plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.resource.decision import Profile
-    from rmpa.resource.declare import Binding, Parameter, ParameterValue
     from rmpa.resource.processes import Processes
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
-    from rmpa.ros.types.messages import Plain
 
 _log = logging.getLogger(__name__)
 _DYNAMIC, _PRIVATE, _ARGUMENT = BindingKind

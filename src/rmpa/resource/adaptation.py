@@ -26,14 +26,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decision import Alarm, AlarmKind, OfferSource, Shortfall, find_shortfalls
-from rmpa.resource.quality import merge
+from rmpa.resource.decision import Alarm, AlarmKind, Decider, OfferSource, ProfileScore, Shortfall, find_shortfalls
+from rmpa.resource.quality import Attribute, Bound, Requirement, Value, merge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.resource.decision import Decider, ProfileScore
-    from rmpa.resource.quality import Attribute, Bound, Requirement, Value
 
 # Factor by which each cool-down of a profile is longer than the one before, up to ``cool_down_max``.
 COOL_DOWN_GROWTH: Final = 2.0

@@ -18,32 +18,28 @@ from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
-from rmpa.resource.decision import AlarmKind, Decider, LearntOffers, OfferSource
+from rmpa.resource.decision import Alarm, AlarmKind, Decider, LearntOffers, OfferSource
 from rmpa.resource.functions import HungError, Preconditions, call_function
-from rmpa.resource.measuring import count_missing
-from rmpa.resource.quality import Requirement
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.measuring import Measuring, count_missing
+from rmpa.resource.quality import Attribute, Bound, Requirement, Value
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.resource.saved import Clients, SavedState
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.descriptor import LEVEL_FOR
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH, printable
 from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.tasks import end_tasks, start_task
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.actuation import Actuation
-    from rmpa.resource.decision import Alarm
     from rmpa.resource.declare import AlarmRule, Context, ManagedNode
-    from rmpa.resource.measuring import Measuring
     from rmpa.resource.processes import Processes
-    from rmpa.resource.quality import Attribute, Bound, Value
-    from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
-    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
+    from rmpa.ros.node.endpoints import Publisher, Received
 
 _log = logging.getLogger(__name__)
 # The longest time in seconds between two looks whether a profile has been applied.
@@ -185,17 +181,14 @@ class Adapter(RuntimePart):
         self._blocked_by_context: dict[str, str] = {}
         self._checking: asyncio.Task[None] | None = None
         self._applying: asyncio.Task[None] | None = None
-        self._requirements: Subscriber | None = None
         self.publishers: dict[str, Publisher] = {}
         self._responses: list[bytes] | None = None
         # The level of ``quality``, and since when, in monotonic seconds.
         self._level: tuple[DiagnosticLevel, float] | None = None
         self._window_end: float | None = None
-        self._clients_check: float | None = None
         self._timers = (
             MachineTimer(self.adaptation.next_timer, self._handle_timer),
             MachineTimer(lambda: self._window_end, self._end_window),
-            MachineTimer(lambda: self._clients_check, self._check_clients),
         )
         self._closed = False
 
@@ -223,7 +216,8 @@ class Adapter(RuntimePart):
             self.adaptation.pin(self.preset, now, restored=True)
         else:
             self.adaptation.reconsider("the resource starts", now)
-        self._window_end, self._clients_check = now + self._settings.window, now + _CLIENTS_INTERVAL
+        self._window_end = now + self._settings.window
+        self._work.add(keep_task(self._watch_clients, "look for clients"))
         self._tell()
 
     async def close(self) -> None:
@@ -232,7 +226,7 @@ class Adapter(RuntimePart):
         for timer in self._timers:
             timer.close()
         self.publishers.clear()
-        await end_tasks(self._checking, self._applying)
+        await super().close()
         await self._preconditions.close()
 
     def _end_window(self, now: float) -> None:
@@ -245,7 +239,7 @@ class Adapter(RuntimePart):
             self._report_alarm(DiagnosticLevel.STALE, text, {}, over=not missing)
         self._judge_alarms()
         if self._checking is None or self._checking.done():
-            self._checking = start_task(self._check_preconditions(), "check preconditions")
+            self._checking = self._work.start(self._check_preconditions(), "check preconditions")
         profile = self.adaptation.profile
         if self.adaptation.window(self._measured, now) and not lacks:  # what is missing tells nothing of the profile
             self.learnt.window(profile, self._measured)
@@ -343,14 +337,16 @@ class Adapter(RuntimePart):
         self.clients.refuse(client, text)
         self._tell()
 
-    def _check_clients(self, now: float) -> None:
-        self._clients_check = now + _CLIENTS_INTERVAL
-        connected = self._requirements.callers if self._requirements is not None else set()
-        for client in self.clients.remove_absent(connected, now):
-            if client in self.adaptation.requirements:
-                _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
-            self.adaptation.release(client, now)
-            self._tell()
+    async def _watch_clients(self) -> None:
+        """Release what clients have asked for that are gone."""
+        while True:
+            await asyncio.sleep(_CLIENTS_INTERVAL)
+            now = self._loop.time()
+            for client in self.clients.remove_absent(self._requirements.callers, now):
+                if client in self.adaptation.requirements:
+                    _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
+                self.adaptation.release(client, now)
+                self._tell()
 
     def enter_context(self, context: Context) -> None:
         """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
@@ -389,7 +385,7 @@ class Adapter(RuntimePart):
         """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
         _log.info("= %s: profile %s: %s", self._name, profile, why)
         self._deciding = {"at": time.time(), "from": self.adaptation.profile, "to": profile, "why": why}
-        self._applying = start_task(self._apply(profile), f"apply {profile}")
+        self._applying = self._work.start(self._apply(profile), f"apply {profile}")
 
     async def _apply(self, name: str) -> None:
         profile, limit, why = self._runtime.resource.profiles[name], self._settings.apply_timeout, ""

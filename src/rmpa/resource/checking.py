@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree as ET
 
 from rmpa.config.toml_file import line_of
-from rmpa.config.values import did_you_mean, suggestion
+from rmpa.config.values import Place, did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.resource.declare import BindingKind
-from rmpa.resource.describing import DESCRIPTIONS
-from rmpa.resource.expression import split_reference
+from rmpa.resource.declare import BindingKind, ManagedNode, Parameter, ParameterValue
+from rmpa.resource.describing import DESCRIPTIONS, Knob, LiveGraph
+from rmpa.resource.expression import Expression, split_reference
 from rmpa.resource.processes import command_of
 from rmpa.ros.types.descriptor import TOPIC
 from rmpa.ros.types.find import find_message_type
@@ -29,11 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
-    from rmpa.config.values import Place
     from rmpa.resource.decision import Profile
-    from rmpa.resource.declare import ManagedNode, Parameter, ParameterValue
-    from rmpa.resource.describing import Knob, LiveGraph
-    from rmpa.resource.expression import Expression
     from rmpa.resource.resource import Resource
 
 # A measured rate that is so much below an offer contradicts it.

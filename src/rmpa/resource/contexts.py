@@ -18,14 +18,13 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.declare import Context
 from rmpa.resource.functions import HungError, call_function
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from rmpa.resource.adapter import Adapter
-    from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Received

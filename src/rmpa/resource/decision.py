@@ -26,13 +26,12 @@ import msgspec
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.quality import Scale
+from rmpa.resource.quality import Attribute, Bound, Scale, Value
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
     from rmpa.resource.expression import Expression
-    from rmpa.resource.quality import Attribute, Bound, Value
 
 # What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall.
 EPSILON: Final = 1e-3

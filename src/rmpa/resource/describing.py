@@ -22,7 +22,7 @@ from rmpa.config.settings import toml_value
 from rmpa.core.identity import is_legal_name
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.resource.actuation import read_config
-from rmpa.resource.declare import Role
+from rmpa.resource.declare import ParameterValue, Role
 from rmpa.resource.description import SUFFIX, read_description
 from rmpa.resource.reconfigure import DESCRIPTION_TYPE
 from rmpa.ros.types.definitions import ARRAY_TYPE, known_types
@@ -31,7 +31,6 @@ from rmpa.ros.types.descriptor import CONFIG_TYPE
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
-    from rmpa.resource.declare import ParameterValue
     from rmpa.ros.environment import NodeFacts
     from rmpa.ros.node.endpoints import Received, Subscriber
     from rmpa.ros.node.node import Node

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK
 from rmpa.resource import limits
-from rmpa.resource.declare import Measure
-from rmpa.resource.runtime import RuntimePart, topic_of
+from rmpa.resource.declare import DeclaredTopic, Measure, Output
+from rmpa.resource.runtime import Runtime, RuntimePart, topic_of
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
-from rmpa.ros.wire.slave_api import read_bus_stats, sent_between
+from rmpa.ros.wire.slave_api import Sent, read_bus_stats, sent_between
 from rmpa.ros.wire.tcpros import printable
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, call_pieces
 from rmpa.runtime.tasks import keep_task
@@ -33,13 +33,10 @@ from rmpa.runtime.tasks import keep_task
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.resource.declare import DeclaredTopic, Output
     from rmpa.resource.quality import Value
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import Runtime
     from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Received
-    from rmpa.ros.wire.slave_api import Sent
 
 _log = logging.getLogger(__name__)
 _HEADER: Final = struct.Struct("<III")

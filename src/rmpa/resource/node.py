@@ -15,7 +15,7 @@ from rmpa.resource.functions import call_hook
 from rmpa.resource.measuring import Measuring
 from rmpa.resource.processes import Processes
 from rmpa.resource.reconfigure import Reconfigure
-from rmpa.resource.runtime import LifecycleState, Runtime
+from rmpa.resource.runtime import LifecycleState, Runtime, RuntimePart
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
 from rmpa.resource.tasks import Tasks
 from rmpa.resource.values import ExpressionValues
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from rmpa.resource.declare import Output
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import RuntimePart
 
 _log = logging.getLogger(__name__)
 

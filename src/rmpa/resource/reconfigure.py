@@ -19,26 +19,22 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
-from rmpa.resource.actuation import lists, read_config
-from rmpa.resource.declare import Parameter
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.actuation import Actuation, lists, read_config
+from rmpa.resource.declare import Parameter, ParameterValue
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
-from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.messages import MessageType, Plain
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.resource.actuation import Actuation
     from rmpa.resource.adapter import Adapter
     from rmpa.resource.contexts import Contexts
-    from rmpa.resource.declare import ParameterValue
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.ros.node.endpoints import Publisher
-    from rmpa.ros.types.messages import Plain
 
 _log = logging.getLogger(__name__)
 DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"

@@ -29,17 +29,38 @@ from rmpa.core.identity import is_legal_name
 from rmpa.resource import declare
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.decision import OfferSource, Profile
-from rmpa.resource.declare import AlarmRule, Context, DeclaredAttribute, Demand, Input, Output, Parameter, Role, Task
+from rmpa.resource.declare import (
+    AlarmRule,
+    Binding,
+    Context,
+    DeclaredAttribute,
+    Demand,
+    Hook,
+    Input,
+    ManagedNode,
+    Output,
+    Parameter,
+    ParameterValue,
+    Role,
+    Task,
+)
 from rmpa.resource.expression import Expression, parse_expression
-from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
+from rmpa.resource.quality import (
+    MEASURED,
+    Attribute,
+    Category,
+    Direction,
+    QoSRequest,
+    Scale,
+    find_attribute,
+    quantity,
+)
 from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from rmpa.resource.declare import Binding, Hook, ManagedNode, ParameterValue
-    from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
 _RATE_MAX: Final = 10_000

@@ -21,8 +21,8 @@ import msgspec
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import CoolDown
-from rmpa.resource.quality import Direction, find_attribute, parse_requirement
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.quality import Attribute, Direction, Requirement, Value, find_attribute, parse_requirement
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.files import replace_file, set_aside
 from rmpa.runtime.tasks import start_task
@@ -32,9 +32,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.resource.declare import Parameter
-    from rmpa.resource.quality import Attribute, Requirement, Value
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import Runtime
 
 _log = logging.getLogger(__name__)
 _SECOND: Final = 1_000_000_000

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.expression import split_reference
-from rmpa.resource.runtime import RuntimePart, topic_of
+from rmpa.resource.expression import Scalar, SourceCall, split_reference
+from rmpa.resource.runtime import Runtime, RuntimePart, topic_of
 from rmpa.ros.types.definitions import ARRAY_TYPE
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.accept import in_thread
@@ -29,10 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.resource.declare import DeclaredTopic, Parameter
-    from rmpa.resource.expression import Scalar, SourceCall
     from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Value
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
