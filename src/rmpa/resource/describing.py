@@ -27,6 +27,7 @@ from rmpa.resource.description import SUFFIX, read_description
 from rmpa.resource.reconfigure import DESCRIPTION_TYPE
 from rmpa.ros.types.definitions import ARRAY_TYPE, known_types
 from rmpa.ros.types.descriptor import CONFIG_TYPE
+from rmpa.runtime.programs import figures
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -256,7 +257,8 @@ def started_by(pid: int) -> dict[str, str | tuple[str, ...]]:
     words = _command(pid)
     if not words:
         return {}
-    parent = _command(_parent(pid))
+    about = figures(pid)
+    parent = _command(about.parent) if about is not None else []
     at = next((n for n, word in enumerate(parent) if Path(word).name == "roslaunch"), -1)
     if at >= 0 and (launched := [word for word in parent[at + 1 :] if not word.startswith("-")]):
         files = [word for word in launched if ":=" not in word]
@@ -281,12 +283,6 @@ def _command(pid: int) -> list[str]:
     except OSError:
         return []
     return [word.decode(errors="replace") for word in data.rstrip(b"\0").split(b"\0") if word]
-
-
-def _parent(pid: int) -> int:
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        return int(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
-    return 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,9 +370,8 @@ def describe(found: Found, title: str = "") -> str:
     ]
     labels: list[str] = []
     for number, topic in enumerate(found.outputs):
-        lines += _topic(
-            found, "output", topic, labels, active=number < _ACTIVE and (not number or _flows(found, topic))
-        )
+        flows = found.live.rate(topic, found.facts.name) > 0
+        lines += _topic(found, "output", topic, labels, active=number < _ACTIVE and (not number or flows))
     for number, topic in enumerate(found.inputs):
         lines += _topic(found, "input", topic, labels, active=number < _ACTIVE)
     pace = _pace(found)
@@ -404,16 +399,9 @@ def _node(found: Found) -> list[str]:
     server = {"server": found.server} if found.server not in ("", name) else {}
     lines = _table("node", "driver", {"name": name} | server, *([f"It runs at the module {module}."] * bool(module)))
     if found.started:
-        return [*lines, "# Start it too: (what is set here is guessed from its process)", *_commented(found.started)]
+        guessed = [f"# {line}" for line in _assigned(found.started)]
+        return [*lines, "# Start it too: (what is set here is guessed from its process)", *guessed]
     return [*lines, '# run = "PACKAGE EXECUTABLE", launch = "PACKAGE FILE" or command = ["PROGRAM"] would start it.']
-
-
-def _commented(values: Mapping[str, object]) -> list[str]:
-    return [f"# {line}" for line in _assigned(values)]
-
-
-def _flows(found: Found, topic: str) -> bool:
-    return found.live.rate(topic, found.facts.name) > 0
 
 
 def _topic(found: Found, kind: str, topic: str, labels: list[str], *, active: bool) -> list[str]:
