@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.adaptation import Adaptation, CoolDown
-from rmpa.resource.decision import AlarmKind, Decider
-from rmpa.resource.declare import AdaptationSettings, Profile
+from rmpa.resource.adaptation import Adaptation, AdaptationSettings, CoolDown
+from rmpa.resource.decision import AlarmKind, Decider, Profile
 from rmpa.resource.quality import MEASURED, Bound, Requirement
 from tests.resource.rig import Action, Apply, Clear, Raise, Reacted, Recorder, bound
 

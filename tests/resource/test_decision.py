@@ -10,8 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decision import Decider, ProfileScore
-from rmpa.resource.declare import Profile
+from rmpa.resource.decision import Decider, Profile, ProfileScore
 from rmpa.resource.quality import (
     MEASURED,
     Attribute,

@@ -4,10 +4,8 @@ import asyncio
 from pathlib import Path
 
 from rmpa.resource import limits
-from rmpa.resource.adaptation import Adaptation
-from rmpa.resource.decision import Decider
-from rmpa.resource.declare import AdaptationSettings, OfferSource, Profile
-from rmpa.resource.learnt import LearntOffer, LearntOffers
+from rmpa.resource.adaptation import Adaptation, AdaptationSettings
+from rmpa.resource.decision import Decider, LearntOffer, LearntOffers, OfferSource, Profile
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Requirement
 from rmpa.resource.resource import Resource

@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, TopicQuality, count_missing
+from rmpa.resource.measuring import QualityMeasurement, TopicQuality, count_missing
 from rmpa.resource.quality import Bound, Requirement, Value
 from rmpa.resource.resource import Resource
+from rmpa.resource.saved import Clients
 
 WALL = 1_700_000_000 * 1_000_000_000
 
@@ -168,36 +169,33 @@ def camera() -> Resource:
 
 
 @pytest.fixture
-def observed() -> ObservedQualities:
-    return ObservedQualities(camera().attributes, "camera", 3.0)
+def observed() -> Clients:
+    return Clients("camera", camera().attributes, 3.0)
 
 
 def asks(client: str) -> dict[str, Requirement]:
     return {client: Requirement(client, {"rate": Bound()})}
 
 
-def judged(
-    observed: ObservedQualities, measured: dict[str, Value], client: str, now: float = 0.0
-) -> dict[str, Value]:
+def judged(observed: Clients, measured: dict[str, Value], client: str, now: float = 0.0) -> dict[str, Value]:
     return observed.worst(measured, asks(client), now)
 
 
-def test_worse_of_measured_and_observed_counts(observed: ObservedQualities) -> None:
+def test_worse_of_measured_and_observed_counts(observed: Clients) -> None:
     observed.report("/viewer", [("rate", "4 Hz"), ("latency", "300 ms"), ("light", "night")], 0.0)
     sent: dict[str, Value] = {"rate": 20.0, "latency": 0.001, "loss": 0.0}
     assert judged(observed, dict(sent), "/viewer") == {"rate": 4.0, "latency": 0.3, "loss": 0.0, "light": "night"}
     assert judged(observed, {"rate": 3.0}, "/viewer")["rate"] == 3.0
-    assert observed.observed("/viewer", "rate") == 4.0
-    assert observed.observed("/viewer", "loss") is observed.observed("/other", "rate") is None
+    assert (observed["/viewer"].observed["rate"], observed["/other"].observed) == (4.0, {})
 
 
-def test_reports_count_for_clients_and_expire(observed: ObservedQualities) -> None:
+def test_reports_count_for_clients_and_expire(observed: Clients) -> None:
     observed.report("/viewer", [("rate", "4 Hz")], 0.0)
     assert judged(observed, {"rate": 20.0}, "/driver") == {"rate": 20.0}
     assert judged(observed, {"rate": 20.0}, "/viewer", 3.0) == {"rate": 4.0}
     assert judged(observed, {"rate": 20.0}, "/viewer", 3.1) == {"rate": 20.0}
     observed.report("/viewer", [("rate", "4 Hz")], 5.0)
-    observed.clear()
+    observed.forget_reports()
     assert judged(observed, {"rate": 20.0}, "/viewer", 5.0) == {"rate": 20.0}
 
 
@@ -211,13 +209,11 @@ def test_reports_count_for_clients_and_expire(observed: ObservedQualities) -> No
         ([("rate", "4 Hz")] * 300, "more than 256"),
     ],
 )
-def test_invalid_report_keeps_the_previous_one(
-    observed: ObservedQualities, values: list[tuple[str, str]], said: str
-) -> None:
+def test_invalid_report_keeps_the_previous_one(observed: Clients, values: list[tuple[str, str]], said: str) -> None:
     observed.report("/viewer", [("rate", "4 Hz")], 0.0)
     with pytest.raises(ConfigError, match=said):
         observed.report("/viewer", values, 1.0)
-    assert observed.observed("/viewer", "rate") == 4.0
+    assert observed["/viewer"].observed == {"rate": 4.0}
 
 
 def test_missing_input_is_reported_once() -> None:

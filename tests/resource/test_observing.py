@@ -9,7 +9,7 @@ from typing import Any
 from rmpa.resource import limits
 from rmpa.resource.description import read_description
 from rmpa.resource.measuring import TopicCounters
-from rmpa.resource.sources import read_zones
+from rmpa.resource.values import read_zones
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE

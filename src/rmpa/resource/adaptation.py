@@ -140,7 +140,7 @@ class Adaptation:
         self.profile = ""
         # The profile that is being applied; empty: none.
         self.applying = ""
-        # The profile that was chosen by hand; empty: the loop decides.
+        # The profile that was chosen by hand; empty: the loop decides. May be set before the first choice.
         self.pinned = ""
         # The alarm that is raised at present.
         self.alarm: Alarm | None = None

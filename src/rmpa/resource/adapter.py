@@ -161,8 +161,6 @@ class Adapter(RuntimePart):
         self.clients = Clients(resource.name, self._attributes, 3 * self._settings.window)
         # The state that was saved before a restart.
         self.saved = SavedState()
-        # The profile chosen by hand before ``start``; empty: the loop decides.
-        self.preset = ""
         # Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first.
         self.reaction: float | None = None
         # The function for which the resource ends; ``None``: none hangs.
@@ -212,8 +210,8 @@ class Adapter(RuntimePart):
         if self._runtime.resource.nodes and self._said:
             await node.subscribe(f"{node.name}/attributes", kind, self._attribute_received)
         self._update_blocked()
-        if self.preset:
-            self.adaptation.pin(self.preset, now, restored=True)
+        if chosen := self.adaptation.pinned:
+            self.adaptation.pin(chosen, now, restored=True)
         else:
             self.adaptation.reconsider("the resource starts", now)
         self._window_end = now + self._settings.window

@@ -153,7 +153,7 @@ class ResourceNode:
         await self.learn()
         if self._persistence is not None:
             saved = self.adapter.saved = await self._persistence.restore()
-            self.adapter.preset, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
+            self.adapter.adaptation.pinned, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
             self.actuation.by_hand |= saved.by_hand
         given = {name: self.resource.parameters[name] for name in self.resource.bound}
         self.actuation.by_hand |= {name: one.value for name, one in given.items() if one.given}

@@ -212,7 +212,7 @@ class Reconfigure(RuntimePart):
                 _log.warning("! %s: from the parameter server: %s; it is ignored [invalid-value]", node.name, error)
                 continue
             if name == PROFILE:
-                self._adapter.preset = str(value)
+                self._adapter.adaptation.pinned = str(value)
             elif name == CONTEXT:
                 self._contexts.chosen = str(value)
             elif not self._known[name].given and self._known[name].binding is None:
