@@ -30,7 +30,7 @@ from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.messages import MessageType, Plain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.resource.decision import Profile
     from rmpa.resource.processes import Processes
@@ -98,8 +98,6 @@ class Actuation(RuntimePart):
         self._bound = runtime.resource.bound
         # Values that people set, by parameter; may be set before ``start``.
         self.by_hand: dict[str, ParameterValue] = {}
-        # Called after a value by hand has come or gone.
-        self.on_change: Callable[[], None] = lambda: None
         # The parameters that some profile sets.
         self._profiled = {name for one in runtime.resource.profiles.values() for name in one.sets}
         # What the profile that runs sets.
@@ -417,4 +415,4 @@ class Actuation(RuntimePart):
         if not same(before, self.by_hand.get(name)):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)
-            self.on_change()
+            self._runtime.changed()

@@ -145,7 +145,6 @@ class Adapter(RuntimePart):
         self._values = values
         self._tasks = tasks
         self._actuation = actuation
-        actuation.on_change = self._tell
         self._processes = processes
         processes.on_change = self._node_changed
         self._measuring = measuring
@@ -188,11 +187,12 @@ class Adapter(RuntimePart):
             MachineTimer(self.adaptation.next_timer, self._handle_timer),
             MachineTimer(lambda: self._window_end, self._end_window),
         )
-        self._closed = False
+        # True before ``start`` and after ``close``.
+        self._closed = True
 
     async def start(self) -> None:
         """Choose the first profile, and serve clients."""
-        self._loop = asyncio.get_running_loop()
+        self._loop, self._closed = asyncio.get_running_loop(), False
         self._blocked_by_needs = await self._preconditions.check()
         node, kind = self._runtime.node, MessageType(ARRAY_TYPE)
         for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
@@ -216,7 +216,7 @@ class Adapter(RuntimePart):
             self.adaptation.reconsider("the resource starts", now)
         self._window_end = now + self._settings.window
         self._work.add(keep_task(self._watch_clients, "look for clients"))
-        self._tell()
+        self._runtime.changed()
 
     async def close(self) -> None:
         """Stop all decisions and reports; a profile that is being applied is given up."""
@@ -244,7 +244,7 @@ class Adapter(RuntimePart):
         for part in self._runtime.parts:
             part.window_ended(self._measured)
         self._report_quality(now)
-        self._tell()
+        self._runtime.changed()
 
     def _judge_alarms(self) -> None:
         """Raise the alarms whose rules are true now, and clear others; one whose rule is unknown stays as it is."""
@@ -264,7 +264,7 @@ class Adapter(RuntimePart):
     async def _check_preconditions(self) -> None:
         self._blocked_by_needs = await self._preconditions.check()
         self._update_blocked()
-        self._tell()
+        self._runtime.changed()
 
     def _update_blocked(self) -> None:
         """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
@@ -284,7 +284,7 @@ class Adapter(RuntimePart):
         self._report_alarm(DiagnosticLevel.WARN, text, {"node": node.name}, over=not ended)
         if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
             self.adaptation.broken(profile, text, self._loop.time())
-        self._tell()
+        self._runtime.changed()
 
     def _observation_received(self, message: Received) -> None:
         try:
@@ -322,7 +322,7 @@ class Adapter(RuntimePart):
             self.adaptation.require(requirement, now)
         elif requirement is not None:
             self.adaptation.release(client, now)
-        self._tell()
+        self._runtime.changed()
 
     def _refuse_once(self, client: str, text: str) -> None:
         """Refuse one of messages that repeat: an error that is told already is not told again."""
@@ -333,7 +333,7 @@ class Adapter(RuntimePart):
         """Publish a response that the client's last message is invalid; ``text`` is the reason."""
         _log.warning("! %s: %s: %s [resource-trouble]", self._name, printable(client), text)
         self.clients.refuse(client, text)
-        self._tell()
+        self._runtime.changed()
 
     async def _watch_clients(self) -> None:
         """Release what clients have asked for that are gone."""
@@ -344,7 +344,7 @@ class Adapter(RuntimePart):
                 if client in self.adaptation.requirements:
                     _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
                 self.adaptation.release(client, now)
-                self._tell()
+                self._runtime.changed()
 
     def enter_context(self, context: Context) -> None:
         """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
@@ -363,7 +363,7 @@ class Adapter(RuntimePart):
             if client != name or not bounds:
                 self.adaptation.release(client, now)
         self.adaptation.reconsider(f"context {context.name}" if context.name else "no context any more", now)
-        self._tell()
+        self._runtime.changed()
 
     def pin(self, profile: str, *, again: bool = False) -> None:
         """Choose a profile by hand; an empty name lets the loop decide. ``again``: apply it even if it runs already.
@@ -372,7 +372,7 @@ class Adapter(RuntimePart):
             ConfigError: The resource has no profile of this name.
         """
         self.adaptation.pin(profile, self._loop.time(), again=again)
-        self._tell()
+        self._runtime.changed()
 
     async def settled(self) -> None:
         """Wait until no profile is being applied, or the resource ends."""
@@ -413,7 +413,7 @@ class Adapter(RuntimePart):
             self.adaptation.failed(name, why, self._loop.time())
         else:
             self.adaptation.applied(name, self._loop.time())
-        self._tell()
+        self._runtime.changed()
 
     def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         """Publish an alarm, or that it is over."""
@@ -443,15 +443,14 @@ class Adapter(RuntimePart):
 
     def _handle_timer(self, now: float) -> None:
         self.adaptation.handle_timer(now)
-        self._tell()
+        self._runtime.changed()
 
-    def _tell(self) -> None:
+    def changed(self) -> None:
         """Publish what may have changed: profile, decision and responses; and move the timers."""
         if self._closed:
             return
         self._runtime.publish_text("profile", self.adaptation.profile)
         self._runtime.publish_text("decision", msgspec.json.encode(self.decision()).decode())
-        self._runtime.changed()
         refused = [name for name, client in self.clients.known.items() if client.refusal]
         statuses = [self._response(name) for name in dict.fromkeys((*self.adaptation.requirements, *refused))]
         serialized = [status.serialize() for status in statuses]

@@ -228,7 +228,6 @@ class _Supervised:
         # What is known of it, as the file of the run has it; ``mark`` is of the program that was started for
         # it, by this run or an earlier one.
         self.run = NodeRun(key=declared.key, node=declared.name, state=NodeState.STOPPED)
-        self._problem = ""
         self._uri = ""
         self._owner = owner
         self._runtime = runtime
@@ -305,10 +304,10 @@ class _Supervised:
             elif pid is None:
                 remedy = "start it, or say in the file how it is started: run, launch or command"
                 raise self._refused("does not run", remedy)
-        except PeerRefused:
+        except PeerRefused as error:
             self._failures += 1
             self._given_up = time.monotonic()
-            self._set(NodeState.FAILED, self._problem)
+            self._set(NodeState.FAILED, error.reason)
             raise
         self._set(NodeState.RUNNING, pid=pid)
         how = "was started" if self.own else "runs already, and is left alone at the end"
@@ -457,7 +456,6 @@ class _Supervised:
             self._process = None
 
     def _refused(self, why: str, remedy: str = "") -> NodeFailed:
-        self._problem = why
         return NodeFailed(f"node {self.declared.name}", why, remedy, code="resource-trouble")
 
     async def _log_end(self) -> str:
