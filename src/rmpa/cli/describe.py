@@ -139,7 +139,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
     graph = await read_graph(master)
     names = {node.name for node in resource.nodes.values()} & set(graph.nodes)
     servers = {node.server or node.name for node in resource.nodes.values()}
-    sources = [source for each in resource.expressions() for source in each.sources.values()]
+    sources = [source for _, each in resource.expressions() for source in each.sources.values()]
 
     async def body(node: Node) -> LiveGraph:
         return await look(

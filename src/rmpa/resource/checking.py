@@ -19,7 +19,7 @@ from rmpa.config.values import Place, did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.resource.declare import BindingKind, ManagedNode, Parameter, ParameterValue
 from rmpa.resource.describing import DESCRIPTIONS, Knob, LiveGraph
-from rmpa.resource.expression import Expression, split_reference
+from rmpa.resource.expression import split_reference
 from rmpa.resource.processes import command_of
 from rmpa.ros.types.descriptor import TOPIC
 from rmpa.ros.types.find import find_message_type
@@ -189,16 +189,7 @@ class GraphCheck:
                 yield self._misfit(place, f"{value:g} is not what the node takes, {_range(knob)}")
 
     def _rules(self) -> Iterator[Misfit]:
-        resource = self.resource
-        parsed: list[tuple[Place, Expression | None]] = [
-            *((("context", one.name, "when"), one.when) for one in resource.contexts.values()),
-            *((("alarm", one.name, "when"), one.when) for one in resource.alarms.values()),
-            *((("profile", one.name, "needs"), one.rule) for one in resource.profiles.values()),
-            *((("attribute", name, "value"), one.value) for name, one in resource.declared_attributes.items()),
-        ]
-        for place, expression in parsed:
-            if expression is None:
-                continue
+        for place, expression in self.resource.expressions():
             for reference in expression.references:
                 if reference.startswith("/") and (problem := self._reference(reference)):
                     yield self._misfit(place, *problem, error=False)

@@ -29,38 +29,17 @@ from rmpa.core.identity import is_legal_name
 from rmpa.resource import declare
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.decision import OfferSource, Profile
-from rmpa.resource.declare import (
-    AlarmRule,
-    Binding,
-    Context,
-    DeclaredAttribute,
-    Demand,
-    Hook,
-    Input,
-    ManagedNode,
-    Output,
-    Parameter,
-    ParameterValue,
-    Role,
-    Task,
-)
+from rmpa.resource.declare import AlarmRule, Context, DeclaredAttribute, Demand, Input, Output, Parameter, Role, Task
 from rmpa.resource.expression import Expression, parse_expression
-from rmpa.resource.quality import (
-    MEASURED,
-    Attribute,
-    Category,
-    Direction,
-    QoSRequest,
-    Scale,
-    find_attribute,
-    quantity,
-)
+from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
 from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from rmpa.resource.declare import Binding, Hook, ManagedNode, ParameterValue
+    from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
 _RATE_MAX: Final = 10_000
@@ -170,12 +149,15 @@ class Resource:
             declare.check_known("node", source.arguments[:1], self.nodes, where)
         return parsed
 
-    def expressions(self) -> Iterator[Expression]:
-        """All expressions of the declaration: rules of contexts, alarms and profiles, and values of attributes."""
-        contexts, alarms, profiles = self.contexts.values(), self.alarms.values(), self.profiles.values()
-        rules = (*(one.when for one in (*contexts, *alarms)), *(one.rule for one in profiles))
-        values = (one.value for one in self.declared_attributes.values())
-        return (one for one in (*rules, *values) if one is not None)
+    def expressions(self) -> Iterator[tuple[tuple[str, str, str], Expression]]:
+        """All expressions of the declaration; each with its kind, its name and its key, as in a description."""
+        rules = (
+            *(("context", one.name, "when", one.when) for one in self.contexts.values()),
+            *(("alarm", one.name, "when", one.when) for one in self.alarms.values()),
+            *(("profile", one.name, "needs", one.rule) for one in self.profiles.values()),
+            *(("attribute", name, "value", one.value) for name, one in self.declared_attributes.items()),
+        )
+        return (((kind, name, key), rule) for kind, name, key, rule in rules if rule is not None)
 
     def output(
         self,

@@ -55,7 +55,7 @@ class ExpressionValues(RuntimePart):
         self._processes = processes
         # Called with the references whose values have changed.
         self.on_change: Callable[[set[str]], None] = lambda _: None
-        expressions = list(runtime.resource.expressions())
+        expressions = [each for _, each in runtime.resource.expressions()]
         references = {reference for each in expressions for reference in each.references}
         # The functions that the expressions call, by their text.
         self._sources: dict[str, SourceCall] = {k: v for each in expressions for k, v in each.sources.items()}
