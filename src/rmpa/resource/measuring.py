@@ -408,7 +408,8 @@ class Measuring(RuntimePart):
         began, carried = self._carried[name]
         carried = carried + size if now - began < _SPAN else 0
         self._carried[name] = (began if carried else now), carried
-        if carried <= limits.MEASURED_BYTES * max(1.0, now - began) or self._values.uses(name):
+        much = carried > limits.MEASURED_BYTES * max(1.0, now - began)
+        if not much or self._values.uses(name) or name not in self._runtime.subscribers:
             return
         del self._carried[name]
         self._counted[topic_of(name, self._runtime.node.name)] = self._runtime.resource.outputs[name]
