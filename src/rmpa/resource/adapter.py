@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from rmpa.resource.actuation import Actuation
     from rmpa.resource.declare import AlarmRule, Context, ManagedNode
-    from rmpa.resource.processes import Processes
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Publisher, Received
@@ -124,7 +123,6 @@ class Adapter(RuntimePart):
         values: What rules refer to, and the values of attributes that have an expression.
         tasks: The resource's tasks, paused while a profile is applied.
         actuation: Applies a profile to other nodes.
-        processes: The nodes that profiles name.
         measuring: Measures the resource.
         stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
@@ -136,7 +134,6 @@ class Adapter(RuntimePart):
         values: ExpressionValues,
         tasks: Tasks,
         actuation: Actuation,
-        processes: Processes,
         measuring: Measuring,
         stop: asyncio.Event,
     ) -> None:
@@ -145,8 +142,6 @@ class Adapter(RuntimePart):
         self._values = values
         self._tasks = tasks
         self._actuation = actuation
-        self._processes = processes
-        processes.on_change = self._node_changed
         self._measuring = measuring
         self._stop = stop
         self._name = runtime.node.name
@@ -174,8 +169,7 @@ class Adapter(RuntimePart):
         self._history: deque[dict[str, Any]] = deque(maxlen=limits.DECISIONS_KEPT)
         self._deciding: dict[str, Any] = {}
         self._preconditions = Preconditions(resource.profiles)
-        self._blocked_by_needs: dict[str, str] = {}
-        self._blocked_by_context: dict[str, str] = {}
+        self._blocked: dict[str, str] = {}
         self._checking: asyncio.Task[None] | None = None
         self._applying: asyncio.Task[None] | None = None
         self.publishers: dict[str, Publisher] = {}
@@ -193,7 +187,7 @@ class Adapter(RuntimePart):
     async def start(self) -> None:
         """Choose the first profile, and serve clients."""
         self._loop, self._closed = asyncio.get_running_loop(), False
-        self._blocked_by_needs = await self._preconditions.check()
+        self._blocked = await self._preconditions.check()
         node, kind = self._runtime.node, MessageType(ARRAY_TYPE)
         for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
             self.publishers[name] = await node.advertise(f"{node.name}/{name}", kind, latch=latch)
@@ -262,23 +256,19 @@ class Adapter(RuntimePart):
             self._report_alarm(level, str(alarm), facts, over=not holds)
 
     async def _check_preconditions(self) -> None:
-        self._blocked_by_needs = await self._preconditions.check()
+        self._blocked = await self._preconditions.check()
         self._update_blocked()
         self._runtime.changed()
 
     def _update_blocked(self) -> None:
-        """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
-        values, profiles = self._values.now(), self._runtime.resource.profiles.values()
-        by_rules = {
-            one.name: f"its rule does not hold: {one.rule}"
-            for one in profiles
-            if one.rule is not None and one.rule.holds(values) is False
-        }
-        by_nodes = self._measuring.blocked() | self._processes.blocked()
-        blocked = by_nodes | by_rules | self._blocked_by_needs | self._blocked_by_context
+        blocked = {name: why for part in self._runtime.parts for name, why in part.blocked().items()}
         self.adaptation.block(blocked, self._loop.time())
 
-    def _node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
+    def blocked(self) -> dict[str, str]:
+        """The profiles whose preconditions do not hold."""
+        return self._blocked
+
+    def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
         """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
         profile = self.adaptation.profile
         self._report_alarm(DiagnosticLevel.WARN, text, {"node": node.name}, over=not ended)
@@ -347,15 +337,13 @@ class Adapter(RuntimePart):
                 self._runtime.changed()
 
     def enter_context(self, context: Context) -> None:
-        """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
+        """Put a context's requirement in force, above those of clients.
 
         Args:
             context: The context; one without a name: no context.
         """
         now, name = self._loop.time(), f"{_CONTEXT_CLIENT}{context.name}"
         before = [client for client in self.adaptation.requirements if client.startswith(_CONTEXT_CLIENT)]
-        barred = set(self._runtime.resource.profiles).difference(context.profiles) if context.profiles else set()
-        self._blocked_by_context = dict.fromkeys(barred, f"not in context {context.name}")
         self._update_blocked()
         if bounds := {key: request.bound(self._attributes[key]) for key, request in context.requires.items()}:
             self.adaptation.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)

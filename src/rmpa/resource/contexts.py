@@ -93,6 +93,12 @@ class Contexts(RuntimePart):
         self._timer.close()
         await super().close()
 
+    def blocked(self) -> dict[str, str]:
+        """The profiles that may not run in the present context."""
+        allowed = self._known[self.current].profiles if self.current else ()
+        barred = self._runtime.resource.profiles.keys() - allowed if allowed else ()
+        return dict.fromkeys(barred, f"not in context {self.current}")
+
     async def choose(self, name: str) -> None:
         """Choose a context by hand; an empty name lets the rules decide again.
 
@@ -174,8 +180,8 @@ class Contexts(RuntimePart):
                 limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
                 await call_function(context.enter, "context", name, limit, remedy)
             runtime.context_outputs = context.outputs
-            self._adapter.enter_context(context)
             self.current, self._since = name, self._loop.time()
+            self._adapter.enter_context(context)
             await self._adapter.settled()
         except HungError as error:
             runtime.release(_HOLDER, drop=True)

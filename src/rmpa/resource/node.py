@@ -76,15 +76,9 @@ class ResourceNode:
         self.values = ExpressionValues(self.runtime, self.processes)
         self.actuation = Actuation(self.runtime, self.processes)
         measuring = Measuring(self.runtime, self.values)
-        self.adapter = Adapter(
-            self.runtime,
-            self.values,
-            self.tasks,
-            self.actuation,
-            self.processes,
-            measuring,
-            stop if stop is not None else asyncio.Event(),
-        )
+        stop = stop if stop is not None else asyncio.Event()
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, measuring, stop)
+        self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)

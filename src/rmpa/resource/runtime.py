@@ -89,6 +89,10 @@ class RuntimePart:
         """Problems apart from the quality, as texts: first what is missing, second what does not work."""
         return [], []
 
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run at present, with the reasons."""
+        return {}
+
 
 class Runtime:
     """Runs one resource on a node: connects its declaration, its topics and its parts.

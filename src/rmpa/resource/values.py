@@ -88,6 +88,14 @@ class ExpressionValues(RuntimePart):
         """Why fields that expressions refer to cannot be read."""
         return [], [f"rule over {field.problem}" for field in self._fields.values() if field.problem]
 
+    def blocked(self) -> dict[str, str]:
+        """The profiles whose rule is false; an unknown rule blocks none."""
+        values, profiles = self.now(), self._runtime.resource.profiles.values()
+        rules = {one.name: one.rule for one in profiles if one.rule is not None}
+        return {
+            name: f"its rule does not hold: {rule}" for name, rule in rules.items() if rule.holds(values) is False
+        }
+
     def now(self) -> dict[str, Scalar]:
         """The known values, by reference."""
         found: dict[str, Scalar] = {}
