@@ -9,6 +9,7 @@ has been applied.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 from typing import TYPE_CHECKING, Final
@@ -21,7 +22,7 @@ from rmpa.resource.functions import HungError, call_function
 from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.loop import MachineTimer
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from rmpa.resource.adapter import Adapter
@@ -63,8 +64,8 @@ class Contexts(RuntimePart):
         self._retry = 0.0
         # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
-        self._next_evaluation: float | None = None
-        self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
+        # Set when a value has changed that a rule refers to.
+        self._change = asyncio.Event()
         # True before ``start`` and after ``close``.
         self._closed = True
 
@@ -84,13 +85,11 @@ class Contexts(RuntimePart):
                 self.chosen = ""
         if self._rules:
             self._values.on_change = self._values_changed
-            self._evaluate(self._loop.time())
-            self._timer.arm()
+            self._work.add(keep_task(self._watch, "rules of contexts"))
 
     async def close(self) -> None:
         """Stop the evaluation of rules; the present context stays."""
         self._closed = True
-        self._timer.close()
         await super().close()
 
     def blocked(self) -> dict[str, str]:
@@ -134,25 +133,25 @@ class Contexts(RuntimePart):
         return next((name for name, rule in self._rules.items() if rule.holds(values)), "")
 
     def _values_changed(self, references: set[str]) -> None:
-        """Evaluate the rules soon if one of them refers to what has changed."""
-        concerned = any(not references.isdisjoint(rule.references) for rule in self._rules.values())
-        if concerned and self._next_evaluation is not None:
-            self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
-            self._timer.arm()
+        if any(not references.isdisjoint(rule.references) for rule in self._rules.values()):
+            self._change.set()
 
-    def _evaluate(self, now: float) -> None:
-        """Begin a switch if the rules select another context."""
-        self._next_evaluation = now + _INTERVAL
-        if not self._lock.locked() and now >= self._retry and self._wanted(now) != self.current:
-            self._work.start(self._follow_rules(), "switch context")
-
-    async def _follow_rules(self) -> None:
-        async with self._lock:
-            try:
-                await self._switch(self._wanted(self._loop.time()))
-            except RmpaError as error:
-                _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, error)
-                self._retry = self._loop.time() + limits.CONTEXT_RETRY
+    async def _watch(self) -> None:
+        """Switch if the rules select another context: when a value has changed, and from time to time."""
+        while True:
+            async with self._lock:
+                now = self._loop.time()
+                try:
+                    if now >= self._retry:
+                        await self._switch(self._wanted(now))
+                except RmpaError as error:
+                    _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, error)
+                    self._retry = self._loop.time() + limits.CONTEXT_RETRY
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_INTERVAL):
+                    await self._change.wait()
+                    await asyncio.sleep(_DEBOUNCE)
+            self._change.clear()
 
     def _choice_received(self, message: Received) -> None:
         async def choose() -> None:

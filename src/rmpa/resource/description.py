@@ -314,15 +314,14 @@ class _Reader:
         table: Any = self._table
         for part in place:
             table = table[part]
-        for name, key in keys.items():
-            if key.default is NEEDED and name not in table:
-                raise BadValue(f"it has no {name}", key.help)
         found = {}
         for name, key in keys.items():
             if name in table:
                 self._place = (*place, name)
                 found[name] = key.type.read(table[name])
-        self._place = place
+                self._place = place
+            elif key.default is NEEDED:
+                raise BadValue(f"it has no {name}", key.help)
         return found
 
     def _named(self, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
