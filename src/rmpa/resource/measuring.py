@@ -201,7 +201,6 @@ class QualityMeasurement:
     def __init__(self, resource: Resource, now: float) -> None:
         self._attributes = resource.attributes
         self._labels = resource.labels
-        self._declared = resource.declared_attributes
         self._topics: dict[str, TopicQuality | TopicCounters] = {}
         # Inputs whose type is not known yet, by name; it is learnt from their first publisher.
         self._unknown: dict[str, DeclaredTopic] = {}
@@ -250,9 +249,7 @@ class QualityMeasurement:
         )
 
     def observe(self, attribute: str, value: Value) -> None:
-        """Record a valid value that the user's code has observed of a declared attribute; others are ignored."""
-        if attribute not in self._declared:
-            return
+        """Record a valid value that the user's code has observed of a declared attribute."""
         if isinstance(value, str):
             self._observed[attribute] = value
         else:
