@@ -272,7 +272,7 @@ async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     member = ResourceNode(declared(lambda: "the lid is shut"), core.uri)
     watcher = RuntimePart(member.runtime)
     watcher.changed = lambda: applied.extend(filter(None, [member.adapter.adaptation.applying]))  # type: ignore[method-assign]
-    member.parts.append(watcher)
+    member.runtime.parts.append(watcher)
     await member.start()
     await until(lambda: applied)
     assert applied[0] == "coarse"

@@ -97,7 +97,7 @@ class Actuation(RuntimePart):
         parameters, nodes = runtime.resource.parameters, runtime.resource.nodes
         self._bound = runtime.resource.bound
         # Values that people set, by parameter; may be set before ``start``.
-        self.by_hand: dict[str, ParameterValue] = {}
+        self.by_hand = {name: parameters[name].value for name in self._bound if parameters[name].given}
         # The parameters that some profile sets.
         self._profiled = {name for one in runtime.resource.profiles.values() for name in one.sets}
         # What the profile that runs sets.

@@ -15,7 +15,7 @@ from rmpa.resource.functions import call_hook
 from rmpa.resource.measuring import Measuring
 from rmpa.resource.processes import Processes
 from rmpa.resource.reconfigure import Reconfigure
-from rmpa.resource.runtime import LifecycleState, Runtime, RuntimePart
+from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
 from rmpa.resource.tasks import Tasks
 from rmpa.resource.values import ExpressionValues
@@ -82,8 +82,7 @@ class ResourceNode:
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
-        # In the order of their start.
-        self.parts: list[RuntimePart] = [
+        self.runtime.parts = [
             self.processes,
             self.values,
             self.tasks,
@@ -97,7 +96,7 @@ class ResourceNode:
         self._persistence: Persistence | None = None
         if state is not None:
             self._persistence = Persistence(self.runtime, self._state, state)
-            self.parts.append(self._persistence)
+            self.runtime.parts.append(self._persistence)
         # The profile that ran last; empty: none yet.
         self._last = ""
         # The transition whose callback runs; empty: none.
@@ -145,19 +144,8 @@ class ResourceNode:
         """
         await self._refuse_duplicate()
         await self.learn()
-        if self._persistence is not None:
-            saved = self.adapter.saved = await self._persistence.restore()
-            self.adapter.adaptation.pinned, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
-            self.actuation.by_hand |= saved.by_hand
-        given = {name: self.resource.parameters[name] for name in self.resource.bound}
-        self.actuation.by_hand |= {name: one.value for name, one in given.items() if one.given}
-        try:
-            # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
-            await self.runtime.start(self.parts, self.configuration.load, self._configure)
-        except BaseException:
-            if self._persistence is not None:
-                await self._persistence.close()
-            raise
+        # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
+        await self.runtime.start(self._restore, self.configuration.load, self._configure)
         try:
             await self.adapter.settled()  # the function of the first profile ends before ``activate``
             if self.adapter.hung is not None:
@@ -166,6 +154,12 @@ class ResourceNode:
         except RmpaError:
             await self.close()
             raise
+
+    async def _restore(self) -> None:
+        if self._persistence is not None:
+            saved = self.adapter.saved = await self._persistence.restore()
+            self.adapter.adaptation.pinned, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
+            self.actuation.by_hand = saved.by_hand | self.actuation.by_hand
 
     async def activate(self) -> None:
         """Activate an inactive resource: open the outputs, call its callback, then start the tasks.

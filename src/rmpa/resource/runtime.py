@@ -24,7 +24,7 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.resource.declare import DeclaredTopic, Output, Parameter
     from rmpa.resource.quality import Value
@@ -105,6 +105,7 @@ class Runtime:
     def __init__(self, resource: Resource, node: Node) -> None:
         self.resource = resource
         self.node = node
+        # In the order of their start.
         self.parts: list[RuntimePart] = []
         self.state = LifecycleState.UNCONFIGURED
         # Called in the event loop with each message that an output has sent or that was received: ``(topic, bytes,
@@ -126,29 +127,28 @@ class Runtime:
         self._unusable: set[tuple[str, str]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
-        self._undo = contextlib.AsyncExitStack()
+        # What is undone at the end, and where the start fails.
+        self.undo = contextlib.AsyncExitStack()
 
-    async def start(self, parts: Iterable[RuntimePart] = (), *first: Callable[[], Awaitable[None]]) -> None:
-        """Register the node, its outputs and inputs, and start the parts in the given order.
+    async def start(self, *first: Callable[[], Awaitable[None]]) -> None:
+        """Register the node, its outputs and inputs, and start the parts.
 
         Args:
-            parts: The parts of the resource.
             first: Called one after the other before the parts start.
 
         Raises:
             UnreachableError: The master does not answer.
             PeerRefused: The master refuses a registration.
         """
-        self.parts = list(parts)
         self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
         try:
-            await self._undo.enter_async_context(self.node)
+            await self.undo.enter_async_context(self.node)
             await self._open_topics()
             for step in first:
                 await step()
             for part in self.parts:
                 await part.start()
-                self._undo.push_async_callback(part.close)
+                self.undo.push_async_callback(part.close)
         except BaseException:
             await self.close()
             raise
@@ -159,7 +159,7 @@ class Runtime:
                 topic = topic_of(output.name, self.node.name)
                 self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
                 output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
-                self._undo.callback(setattr, output, "on_publish", None)
+                self.undo.callback(setattr, output, "on_publish", None)
         for parameter in self.resource.parameters.values():
             self.bind(parameter, "on_change", self._parameter_changed)
         for name in (descriptor.TOPIC, "state", "profile", "decision", "context"):
@@ -173,12 +173,12 @@ class Runtime:
 
     async def close(self) -> None:
         """Close the parts in reverse order of their start, then the node."""
-        await self._undo.aclose()
+        await self.undo.aclose()
 
     def bind(self, declared: object, field: str, function: Callable[..., None]) -> None:
         """Have a declared thing call a function in the event loop, until the resource ends."""
         setattr(declared, field, functools.partial(self.call_in_loop, function))
-        self._undo.callback(setattr, declared, field, None)
+        self.undo.callback(setattr, declared, field, None)
 
     def publish_text(self, name: str, text: str) -> None:
         """Publish a text on one of the resource's latched topics ``std_msgs/String``, if it differs from the last."""

@@ -390,6 +390,7 @@ class Persistence(RuntimePart):
 
     async def restore(self) -> SavedState:
         """Read the file, restore the parameters and return the saved state; called before the parts start."""
+        self._runtime.undo.push_async_callback(self.close)
         resource, name = self._runtime.resource, self._runtime.node.name
         found, lost = SavedState(), list[str]()
         try:
