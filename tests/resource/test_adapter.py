@@ -36,7 +36,7 @@ def decided(*, runs: bool = True, rate: float = 20.0) -> Adaptation:
     one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, [FAST]), AdaptationSettings(), Recorder())
     if runs:
         one.reconsider("it starts", 0.0)
-        one.applied("fast", 0.0)
+        one.applied(0.0)
         one.require(asked(rate), 0.0)
     return one
 

@@ -280,7 +280,7 @@ def test_a_change_by_what_was_learnt_says_so() -> None:
     one = Adaptation(ATTRIBUTES, decider, AdaptationSettings(offers=OfferSource.LEARNT), out)
     one.require(Requirement("/a", {"rate": WANTED}), 0.0)
     assert out.told == [Apply("slow", "/a asks for a quality")]
-    one.applied("slow", 0.0)
+    one.applied(0.0)
     one.pin("quick", 1.0)
     why = "quick was chosen by hand (learnt: quick has given rate 10 Hz, declared 40 Hz)"
     assert out.told[-1] == Apply("quick", why)

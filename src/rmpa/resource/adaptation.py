@@ -274,35 +274,28 @@ class Adaptation:
             self.begin_cool_down(self.profile, why, now)
             self._apply(effort.profile, "none can serve: best effort", since)
 
-    def applied(self, profile: str, now: float) -> None:
-        """Report that the profile has been applied; ignored unless it is the one that is being applied."""
-        if not profile or profile != self.applying:
-            return
-        self.profile, self.applying = profile, ""
+    def applied(self, now: float) -> None:
+        """Report that the profile that was being applied is in force."""
+        self.profile, self.applying = self.applying, ""
         self._active_since = now
         self._windows.clear()
         reaction, self._cause = max(0.0, now - self._cause), math.inf
-        self._out.reacted(profile, reaction)
+        self._out.reacted(self.profile, reaction)
         at_once, self._replan_at_once = self._replan_at_once, False
         self._plan(now, "what is asked has changed meanwhile", at_once=at_once)
 
-    def failed(self, profile: str, why: str, now: float) -> None:
-        """Report that the profile could not be applied; the next best profile is applied instead.
-
-        The report is ignored unless the profile is the one that is being applied.
-        """
-        if not profile or profile != self.applying:
-            return
+    def failed(self, why: str, now: float) -> None:
+        """Report that the profile could not be applied; the next best profile is applied instead."""
+        profile, self.applying = self.applying, ""
         self.begin_cool_down(profile, why, now)
-        self.applying = ""
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         self._plan(now, f"{profile} failed: {why}", again=True)
 
-    def broken(self, profile: str, why: str, now: float) -> None:
+    def broken(self, why: str, now: float) -> None:
         """Report that the running profile does not work any more; the next best profile is applied instead."""
-        if profile and profile == self.profile and not self.applying:
-            self.begin_cool_down(profile, why, now)
-            self._plan(now, f"{profile} does not work any more: {why}", at_once=True)
+        if not self.applying:
+            self.begin_cool_down(self.profile, why, now)
+            self._plan(now, f"{self.profile} does not work any more: {why}", at_once=True)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""

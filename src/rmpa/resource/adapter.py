@@ -270,10 +270,10 @@ class Adapter(RuntimePart):
 
     def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
         """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
-        profile = self.adaptation.profile
         self._report_alarm(DiagnosticLevel.WARN, text, {"node": node.name}, over=not ended)
-        if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
-            self.adaptation.broken(profile, text, self._loop.time())
+        running = self._runtime.resource.profiles.get(self.adaptation.profile)
+        if ended and running is not None and node.key in running.nodes:
+            self.adaptation.broken(text, self._loop.time())
         self._runtime.changed()
 
     def _observation_received(self, message: Received) -> None:
@@ -398,9 +398,9 @@ class Adapter(RuntimePart):
         self.clients.forget_reports()
         if why:
             self._history.append(self._deciding | {"took": self._loop.time() - began, "failed": why})
-            self.adaptation.failed(name, why, self._loop.time())
+            self.adaptation.failed(why, self._loop.time())
         else:
-            self.adaptation.applied(name, self._loop.time())
+            self.adaptation.applied(self._loop.time())
         self._runtime.changed()
 
     def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
