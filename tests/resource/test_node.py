@@ -166,7 +166,7 @@ async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogC
     async with Node("ear", master_uri=core.uri) as node, asyncio.timeout(40):
         await node.subscribe("/loud/words", "std_msgs/String", lambda m: words.append(m.message.data))
         await node.subscribe("/loud/mode", "std_msgs/String", lambda m: modes.append(m.message.data))
-        await member.runtime.start(member.parts, member._configure)
+        await member.runtime.start(member._configure)
         while not (member.runtime._publishers["words"].subscribers and member.adapter.adaptation.profile == "plain"):
             await asyncio.sleep(0.01)
         while not member.runtime._publishers["mode"].subscribers:
