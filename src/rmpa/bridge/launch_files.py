@@ -9,8 +9,8 @@ import tomllib
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rmpa.bridge import limits
+from rmpa.config.toml_file import other_writer
 from rmpa.config.values import BadValue, read_duration
-from rmpa.config.writers import other_writer
 from rmpa.core.errors import RmpaError
 from rmpa.runtime.programs import StartRule
 

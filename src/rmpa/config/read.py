@@ -11,11 +11,9 @@ from urllib.parse import urlsplit
 from rmpa.config.module_name import NAME_FILE, NameSource, choose_name, kept_name, state_dir
 from rmpa.config.peer_rules import peer_warnings, permission_problems
 from rmpa.config.rules import contract_warnings
-from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
-from rmpa.config.toml_file import dotted, line_of, read_toml, value_at
+from rmpa.config.toml_file import check_writers, dotted, line_of, read_toml, value_at
 from rmpa.config.values import BadValue, did_you_mean, suggestion
-from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -299,8 +297,6 @@ def _file_layer(path: Path, environ: Mapping[str, str]) -> _Layer:
 
 def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
     for variable in sorted(environ):
-        if variable in REMOVED:
-            raise ConfigError(variable, "is not a variable any more", REMOVED[variable], code="removed")
         if variable.startswith("RMPA_") and variable not in VARIABLES:
             near = did_you_mean(variable, VARIABLES)
             notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))

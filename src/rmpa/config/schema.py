@@ -219,27 +219,3 @@ def rules_of(
         "properties": {name: key.type.json_schema | {"description": key.help} for name, key in keys.items()},
     }
     return ValueType(read, {"type": "array", "items": schema | ({"required": needed} if needed else {})})
-
-
-_REMEDIES: Final = {
-    "peer.remap": 'write remap_in = { "FROM" = "TO" } for direction = "in", remap_out = { "FROM" = "TO" } for "out"; '
-    "it holds for topics of all types",
-    "web_token": "use the one token; control and drive of [web] say what clients may do with it",
-    "core.fresh": 'write keep = "never" in place of true',
-    "RMPA_FRESH": "set RMPA_KEEP=never in its place",
-    "--fresh": "write --keep never",
-    "--known": "rosbag record /SONAR/descriptor keeps what a resource was",
-    "realtime.cpus RMPA_REALTIME_CPUS": "write CPUAffinity= into the systemd unit, or start it by `taskset -c`",
-    "realtime.keep_awake RMPA_REALTIME_KEEP_AWAKE": "keep the CPUs awake by the system: "
-    "tuned's profile latency-performance, or processor.max_cstate=1",
-    "gateway.ros1_bridge gateway.ros1_bridge_namespace RMPA_GATEWAY_ROS1_BRIDGE RMPA_GATEWAY_ROS1_BRIDGE_NAMESPACE "
-    "--ros1-bridge --no-ros1-bridge": "let a gateway with a site name join those robots, "
-    "or run zenoh-bridge-ros1 beside rmpa",
-    "mesh.links mesh.full_mesh_up_to RMPA_LINKS RMPA_FULL_MESH_UP_TO": "leave it out: "
-    "up to 256 modules keep a link to each other; make more of them sites (docs/guides/sites.md)",
-    "gateway.store RMPA_GATEWAY_STORE gateway.rule.keep": "no gateway keeps values: "
-    "record the topic with rosbag, or keep its key by a storage of Zenoh",
-    "--yes": "leave it out: nothing is asked",
-}
-# What to use in place of a key, variable or option that is gone.
-REMOVED: Final = {name: remedy for names, remedy in _REMEDIES.items() for name in names.split()}

@@ -13,22 +13,17 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits, peer_rules
-from rmpa.config.recording import RecordSettings
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
 from rmpa.config.schema import setting, settings_of, table
 from rmpa.config.values import (
     BOOL,
     BOUND,
-    COMMAND_AGE,
-    CORE_KEEP,
-    CORE_MODE,
+    BYTES_A_SECOND,
     DOMAIN,
     DSCP,
-    FIFO_PRIORITY,
     HOST,
     HOST_PORT,
     INTERFACE,
-    LOG_LEVEL,
     MASTER_URI,
     MULTICAST,
     NAME,
@@ -39,13 +34,18 @@ from rmpa.config.values import (
     PEER,
     PEER_GLOB,
     PORT,
-    PORT_OR_ANY,
+    RATE,
     SERVICE_GLOB,
     TEXT,
     TIMEOUT,
+    TOPIC_GLOB,
+    TYPE_GLOB,
     HostPort,
     Multicast,
+    duration_of,
     list_of,
+    whole_number,
+    word_of,
 )
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 
@@ -169,7 +169,9 @@ class RealtimeSettings:
 
     enabled: bool = setting(False, BOOL, "Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
     priority: int = setting(
-        50, FIFO_PRIORITY, "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first."
+        50,
+        whole_number(1, 99, "a priority of SCHED_FIFO"),
+        "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
     )
     lock_memory: bool = setting(True, BOOL, "Keep the agent's memory in RAM (mlockall).")
 
@@ -215,9 +217,59 @@ class WebSettings:
     )
     command_age_ms: int = setting(
         0,
-        COMMAND_AGE,
+        whole_number(0, 60_000, "milliseconds (0: any age)", "MS"),
         "Drop what rosbridge and Foxglove clients publish, call and set if it may be older than this; 0: take all.",
         live=True,
+    )
+
+
+_MEGABYTES: Final = whole_number(1, 1_000_000, "a number of MB", "MB")
+# What keeps a recording by itself.
+ALARM, PEER_LOST, NODE_DIED, CONTRACT = "alarm", "peer_lost", "node_died", "contract"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """What ``rmpa record`` keeps of the last minutes, and whether the agent starts it."""
+
+    enabled: bool = setting(
+        False, BOOL, "Start rmpa record with the agent, and restart it if it ends.", option="--record/--no-record"
+    )
+    topics: tuple[str, ...] = setting(("/**",), list_of(TOPIC_GLOB), "Topics of this module's nodes to record.")
+    deny: tuple[str, ...] = setting((), list_of(TOPIC_GLOB), "Topics that are not recorded.", shown_default="none")
+    seconds: float | None = setting(120.0, duration_of("a duration"), "How much of the past is there to keep.")
+    megabytes: int = setting(512, _MEGABYTES, "The most that the past takes on the disk, MB.")
+    kept_megabytes: int = setting(
+        4096, _MEGABYTES, "The most that kept recordings take, MB; the oldest that no person asked for give way."
+    )
+    topic_rate: int | None = setting(
+        4_000_000, BYTES_A_SECOND, "The most that one topic may write; what is above it is left out, and counted."
+    )
+    total_rate: int | None = setting(
+        None, BYTES_A_SECOND, "The most that all topics together may write; likewise.", shown_default="unlimited"
+    )
+    thin: float | None = setting(5.0, RATE, "Messages a second of thin_types.")
+    thin_types: tuple[str, ...] = setting(
+        ("sensor_msgs/*Image", "sensor_msgs/PointCloud*"), list_of(TYPE_GLOB), "Types that are thinned."
+    )
+    keep_on: tuple[str, ...] = setting(
+        (ALARM, PEER_LOST, NODE_DIED),
+        list_of(
+            word_of(
+                (ALARM, PEER_LOST, NODE_DIED, CONTRACT), "a reason", "it is alarm, peer_lost, node_died or contract"
+            )
+        ),
+        "What keeps a recording, at all modules that are linked: alarm, peer_lost, node_died, contract.",
+    )
+    stop_topics: tuple[str, ...] = setting(
+        (),
+        list_of(TOPIC_GLOB),
+        "Topics of emergency stops: a message (of std_msgs/Bool: true) keeps a recording.",
+        shown_default="none",
+    )
+    after: float | None = setting(5.0, duration_of("a duration"), "How long a recording goes on behind its reason.")
+    fsync: float | None = setting(
+        1.0, duration_of("a duration"), "How often the disk must have it: what a power cut may take; infinite: never."
     )
 
 
@@ -283,7 +335,12 @@ class Settings:
     domain: int = setting(0, DOMAIN, "Agents join only those of the same domain, 0 to 232.", option="--domain")
     core_mode: str = setting(
         "embedded",
-        CORE_MODE,
+        word_of(
+            ("embedded", "external"),
+            "a kind of core",
+            "embedded: the agent's own; external: a roscore that runs already",
+            "MODE",
+        ),
         "embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI.",
         key="core.mode",
         env="RMPA_CORE",
@@ -300,7 +357,13 @@ class Settings:
     )
     core_keep: str = setting(
         "auto",
-        CORE_KEEP,
+        word_of(
+            ("auto", "always", "never"),
+            "a choice",
+            "auto: if a node of the run before still runs, or the core died; always; never: begin empty, "
+            "as roscore does",
+            "WHEN",
+        ),
         "Restore nodes and parameters of the last run; auto: if one of its nodes still runs, or the core crashed.",
         key="core.keep",
         env="RMPA_KEEP",
@@ -315,7 +378,11 @@ class Settings:
     )
     core_port: int = setting(11311, PORT, "The ROS core's port.", key="core.port", option="--core-port")
     port: int = setting(
-        0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any free one.", key="mesh.port", option="--port"
+        0,
+        whole_number(0, 65535, "a port (0: any)", "PORT"),
+        "The mesh's port, TCP and UDP; 0: any free one.",
+        key="mesh.port",
+        option="--port",
     )
     interfaces: tuple[str, ...] = setting(
         (),
@@ -400,7 +467,17 @@ class Settings:
         shown_default="none",
     )
     log_level: str = setting(
-        "info", LOG_LEVEL, "debug, info, warning or error.", key="log.level", option="--log-level", live=True
+        "info",
+        word_of(
+            ("debug", "info", "warning", "error"),
+            "a log level",
+            "the levels are debug, info, warning, error",
+            "LEVEL",
+        ),
+        "debug, info, warning or error.",
+        key="log.level",
+        option="--log-level",
+        live=True,
     )
     log_json: bool = setting(False, BOOL, "Log one JSON object a line.", key="log.json", option="--log-json")
     runtime_dir: str = setting(

@@ -29,7 +29,7 @@ from rmpa.client import (
     TopicGone,
     changes,
 )
-from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST
+from rmpa.config.settings import ALARM, CONTRACT, NODE_DIED, PEER_LOST
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches_any
 from rmpa.observe.control_client import ControlClient, choose_agent
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.client import AgentEvent
-    from rmpa.config.recording import RecordSettings
+    from rmpa.config.settings import RecordSettings
     from rmpa.observe.snapshot import Snapshot
     from rmpa.record.format import SegmentWriter
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 from rosbags.typesys.base import TypesysError
 
-from rmpa.config.writers import check_writers
+from rmpa.config.toml_file import check_writers
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
