@@ -17,14 +17,14 @@ import pytest
 from rmpa.bridge import launched, limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import LAUNCH, Launcher
-from rmpa.bridge.launch_files import is_name, list_files
-from rmpa.bridge.launched import LaunchedResource, ModuleResources
+from rmpa.bridge.launched import LaunchedResource, ModuleResources, is_name, list_files
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import ResourceSettings, Settings, TrustSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.runtime.programs import StartRule, figures
 from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_peers import AskedPeers
 from tests.waiting import until
 
 FAKE = Path(__file__).parent / "fake_resource.py"
@@ -36,17 +36,15 @@ class Module:
 
     def __init__(self, home: Path, *rules: PermissionRule, default: str = "deny", **resources: Any) -> None:
         gate = PermissionGate(Permissions(TrustSettings(default, rules=rules))) if rules else OPEN_GATE
-        self.handlers: dict[str, Any] = {}
         self.published: dict[str, dict[str, str]] = {}
         self.answers: dict[str, Any] = {}
-        rpc = SimpleNamespace(on_request=lambda what, handler, _: self.handlers.update({what: handler}))
-        rpc.request = self._request
+        self.rpc = AskedPeers(lambda session, _what, _args: self.answers[session.link.name])
         given = ResourceSettings(**{"folder": str(home / "resources"), **resources})
         settings = Settings(name="base", state_dir=str(home / "state"), resources=given)
         core = SimpleNamespace(uri="http://127.0.0.1:1/", publishers=lambda topic: self.published.get(topic, {}))
         self.sessions: list[Any] = []
         bridge: Any = SimpleNamespace(
-            rpc=rpc,
+            rpc=self.rpc,
             core=core,
             context=BridgeContext.of(settings, gate),
             rng=random.random,
@@ -61,19 +59,14 @@ class Module:
         path.write_text(text)
         return path
 
-    async def _request(self, session: Any, _what: str, args: dict[str, Any], _timeout: float) -> Any:
-        answer = self.answers[session.link.name]
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
     async def do(self, what: str, name: str | None = None, **more: Any) -> ModuleResources:
         (found,) = await self.part.answer({"what": what, "name": name, **more})
         return found
 
     async def ask(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
         session = SimpleNamespace(link=SimpleNamespace(name=asker))
-        found: ModuleResources = await self.handlers[LAUNCH](session, {"what": what, "name": name, **more})
+        handler: Any = self.rpc.handlers[LAUNCH]
+        found: ModuleResources = await handler(session, {"what": what, "name": name, **more})
         return found
 
     async def states(self) -> dict[str, str]:

@@ -15,13 +15,14 @@ from rmpa.bridge import limits
 from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.log import LEVEL, LINES, ModuleLogs
-from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing
+from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.identity import OWN_NODE
 from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_peers import AskedPeers
 
 NOW = 1_800_000_000 * 10**9
 
@@ -45,11 +46,11 @@ def ring_of(*lines: tuple[str, str, int]) -> LogRing:
     return ring
 
 
-def texts(found: LogLines) -> list[str]:
+def texts(found: ModuleLog) -> list[str]:
     return [line.text for line in found.lines]
 
 
-def ask(ring: LogRing, now_ns: int = NOW, **query: Any) -> LogLines:
+def ask(ring: LogRing, now_ns: int = NOW, **query: Any) -> ModuleLog:
     return ring.find(LogQuery.of(query), now_ns)
 
 
@@ -149,13 +150,13 @@ class Module:
 
     def __init__(self, name: str, *rules: PermissionRule) -> None:
         gate = PermissionGate(Permissions(TrustSettings(rules=rules))) if rules else OPEN_GATE
-        self.core, self.handlers = Core(), dict[str, Any]()
+        self.core = Core()
         self.peers: list[Any] = []
-        rpc = SimpleNamespace(on_request=lambda what, handler, _: self.handlers.update({what: handler}))
-        rpc.request = self._request
+        rpc = AskedPeers(self._answer)
         context = BridgeContext.of(Settings(name=name), gate)
         bridge: Any = SimpleNamespace(core=self.core, rpc=rpc, context=context, sessions=self.peers)
         self.logs = ModuleLogs(bridge)
+        self.handlers = rpc.handlers
         self.answers: dict[str, Any] = {}
         self.logs.start()
 
@@ -166,10 +167,8 @@ class Module:
         link = SimpleNamespace(name=name, guid=f"guid of {name}")
         self.peers.append(SimpleNamespace(link=link, time=time, linked=linked))
 
-    async def _request(self, session: Any, _what: str, args: dict[str, Any], _timeout: float) -> Any:
+    def _answer(self, session: Any, _what: str, args: dict[str, Any]) -> Any:
         answer = self.answers[session.link.name]
-        if isinstance(answer, Exception):
-            raise answer
         return answer(args) if callable(answer) else answer
 
 
@@ -192,7 +191,8 @@ def asker(name: str = "arm") -> Any:
 async def test_a_peer_reads_and_sets_the_log_of_the_nodes_that_a_permission_names(say: Any) -> None:
     module = Module("base", PermissionRule(("arm",), names={"log": ("/talker",)}))
     say(module)
-    lines, level = module.handlers[LINES], module.handlers[LEVEL]
+    lines: Any = module.handlers[LINES]
+    level: Any = module.handlers[LEVEL]
     assert texts(lines(asker(), {})) == SAID[:1]
     with pytest.raises(RmpaError, match="do not let eve use the log of"):
         lines(asker("eve"), {})
@@ -212,12 +212,13 @@ async def test_lines_that_came_from_another_module_are_not_kept_again_and_the_ag
     logging.getLogger("rmpa.test").error("! the agent's own [failed]")
     await asyncio.to_thread(logging.getLogger("rmpa.test").error, "! of a thread [failed]")
     await asyncio.sleep(0)
-    found = module.handlers[LINES](asker(), {"level": "info"})
+    lines: Any = module.handlers[LINES]
+    found = lines(asker(), {"level": "info"})
     assert texts(found) == [*SAID, "! the agent's own [failed]", "! of a thread [failed]"]
     assert [line.agent for line in found.lines] == [False, False, True, True]
     await module.logs.close()
     logging.getLogger("rmpa.test").error("! after its end [failed]")
-    assert len(module.handlers[LINES](asker(), {}).lines) == 4
+    assert len(lines(asker(), {}).lines) == 4
 
 
 async def test_the_logs_of_all_modules_have_one_clock_and_each_problem_is_told(say: Any) -> None:

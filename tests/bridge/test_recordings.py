@@ -23,6 +23,7 @@ from rmpa.config.peer_rules import PermissionRule
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_peers import AskedPeers
 
 NOW = 1_800_000_000 * 10**9
 
@@ -37,30 +38,26 @@ class World:
                 (self.folder / name).mkdir(parents=True)
         settings = Settings(name="arm", state_dir=str(state), trust=TrustSettings(rules=rules))
         gate = PermissionGate(Permissions(settings.trust)) if secured else OPEN_GATE
-        self.handlers: dict[str, Any] = {}
         self.asked: list[tuple[str, dict[str, Any]]] = []
         self.answer: Any = ""
         self.peer = SimpleNamespace(link=SimpleNamespace(name="base", guid="g"), time=LinkTime(), linked=True, peer=1)
         self.sessions = [self.peer]
-        rpc = SimpleNamespace(
-            on_request=lambda what, handler, _: self.handlers.update({what: handler}), request=self._request
-        )
+        self.rpc = AskedPeers(self._answer)
         bridge = SimpleNamespace(
-            rpc=rpc,
+            rpc=self.rpc,
             context=BridgeContext.of(settings, gate),
             sessions=SimpleNamespace(linked=lambda: self.sessions),
         )
         self.part = Recordings(bridge)  # type: ignore[arg-type] # it has what it uses
 
-    async def _request(self, _session: object, what: str, args: dict[str, Any], *_: float) -> Any:
+    def _answer(self, _session: object, what: str, args: dict[str, Any]) -> Any:
         self.asked.append((what, args))
-        if isinstance(self.answer, Exception):
-            raise self.answer
         return self.answer
 
     async def ask(self, what: str, **args: Any) -> Any:
         """What the peer is answered."""
-        return await self.handlers[what](self.peer, args)
+        handler: Any = self.rpc.handlers[what]
+        return await handler(self.peer, args)
 
     async def requests(self) -> list[Kept]:
         """What the recorder is asked to keep."""

@@ -566,17 +566,21 @@ async def _serve(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, realtime, load)
-    web, recorder = ChildProcess.web(settings, random.random), ChildProcess.recorder(settings, random.random)
+    web = ChildProcess.web(settings, random.random)
+    recorder = ChildProcess("record", "recording-stopped", settings, random.random)
     agent.reloaded = web.reload
 
     async def start() -> None:
         await agent.start()
         await asyncio.to_thread(started)
         for child, wanted in ((web, settings.web.enabled), (recorder, settings.record.enabled)):
-            await (child.start() if wanted else child.close())
+            if wanted:
+                child.begin()
+            else:
+                await child.stop()  # an agent before may have left it
 
     async def close() -> None:
-        await asyncio.gather(web.close(), recorder.close())
+        await asyncio.gather(web.stop(), recorder.stop())
         await agent.close()
 
     await serve(start, close, agent.reloader)

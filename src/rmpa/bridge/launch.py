@@ -13,22 +13,27 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from rmpa.bridge import limits
-from rmpa.bridge.launch_files import REFUSED, LaunchFile, circles, is_name, list_files
-from rmpa.bridge.launched import ModuleResources, ResourceProgram, load_runs
+from rmpa.bridge.launched import (
+    REFUSED,
+    LaunchFile,
+    ModuleResources,
+    ResourceProgram,
+    circles,
+    is_name,
+    list_files,
+    load_runs,
+)
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import why_unanswered
+from rmpa.bridge.rpc import meant, no_such_module
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import suggestion
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import is_meant
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.files import replace_file
-from rmpa.runtime.programs import RUNS, CpuShares, ProgramMark
+from rmpa.runtime.kept_program import ProgramNote
+from rmpa.runtime.programs import RUNS, CpuShares
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 from rmpa.trust.permissions import PermissionDecision, asker_name, refusal
 
@@ -47,21 +52,10 @@ LIST: Final = "list"
 LOG: Final = "log"
 # What can be asked for, with what the log says of it.
 ACTS: Final = {LIST: "", "start": "starts", "stop": "stops", "restart": "restarts", LOG: ""}
-# In the folder of ``RUNS``: the processes that the agent has started. No resource is named so.
-_OWN_FILE: Final = ".agent.json"
 # Seconds between two looks at what resources tell of themselves, while a start waits for it.
 _LOOK: Final = 0.1
 # Seconds between two looks whether the conditions of a start at boot hold.
 _BOOT_LOOK: Final = 0.5
-_EARLIER: Final = "its agent is of an earlier release, which starts nothing; install this release there"
-
-
-class _Kept(msgspec.Struct, frozen=True):
-    """A process as the agent's file has it."""
-
-    mark: ProgramMark
-    file: str
-    restarts: int = 0
 
 
 class Launcher(Part):
@@ -81,7 +75,6 @@ class Launcher(Part):
         self._waiting: dict[str, StartRule] = {}
         self._work = OwnedTasks()
         self._main: asyncio.Task[None] | None = None
-        self._writes = asyncio.Lock()
         self.shares = CpuShares()
         bridge.rpc.on_request(LAUNCH, self._asked, Needs((Access.LAUNCH,), "the resource; lists leave others out"))
 
@@ -139,37 +132,16 @@ class Launcher(Part):
     async def _adopt(self) -> None:
         """Take over the processes that an agent before has started."""
         try:
-            path = self._state / RUNS / _OWN_FILE
-            kept = msgspec.json.decode(await asyncio.to_thread(path.read_bytes), type=dict[str, _Kept])
-        except (OSError, msgspec.DecodeError, RmpaError):
+            notes = await asyncio.to_thread(_load_notes, self._state)
+        except RmpaError:
             return
-        for name, former in kept.items():
-            self._of(name, self._folder / former.file).adopt(former.mark, former.restarts, self._bridge.core.uri)
-
-    async def _note(self) -> None:
-        """Keep which processes run, for the next agent."""
-        kept = {
-            name: _Kept(one.mark, one.path.name, one.restarts)
-            for name, one in self._launched.items()
-            if one.mark is not None
-        }
-        path = self._state / RUNS / _OWN_FILE
-
-        def save() -> None:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            replace_file(path, msgspec.json.encode(kept))
-
-        async with self._writes:
-            try:
-                await asyncio.to_thread(save)
-            except OSError as error:
-                _log.warning("! what runs cannot be noted for the next agent: %s [directory-unusable]", error)
+        for name, note in notes.items():
+            self._of(name, self._folder / note.made_of[0]).adopt(note)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
-        if name not in self._launched:
-            self._launched[name] = ResourceProgram(name, path, self._state, self._bridge.rng, self._note)
-        self._launched[name].path = path
-        return self._launched[name]
+        one = self._launched.setdefault(name, ResourceProgram(name, path, self._state, self._bridge))
+        one.path = path
+        return one
 
     async def _boot(self) -> None:
         try:
@@ -240,7 +212,11 @@ class Launcher(Part):
         if other is not None and other.process.runs and other.process != one.mark:
             text = f"it runs already, and was started by hand (process {other.process.pid})"
             raise RmpaError(text, code=REFUSED)
-        await one.start(self._bridge.core.uri)
+        try:
+            await one.start()
+        except OSError as error:
+            one.state, one.why = "failed", f"cannot be started: {error.strerror}"
+            raise RmpaError(f"{one.name} {one.why}", code="resource-stopped") from None
 
     async def starters(self) -> dict[str, str]:
         """The resources that have started nodes of this module, by node."""
@@ -284,24 +260,15 @@ class Launcher(Part):
             return [await self._do(request), *await asyncio.gather(*(self._ask(one, request) for one in sessions))]
         if module is None or module == own:
             return [await self._do(request)]
-        fitting = [one for one in sessions if is_meant(str(module), one.link.name, str(one.link.guid))]
-        if not fitting:
-            names = [own, *(one.link.name for one in sessions)]
-            near = suggestion(str(module), names, "`rmpa peer list` shows which modules are there")
-            problem = f"no linked module has this name; {near}"
-            return [ModuleResources(module=str(module), problem=problem, code="unknown-name")]
-        return [await self._ask(fitting[0], request)]
+        if fitting := meant(sessions, module):
+            return [await self._ask(fitting[0], request)]
+        error = no_such_module(str(module), own, sessions)
+        return [ModuleResources(module=str(module), problem=str(error), code=error.code)]
 
     async def _ask(self, session: PeerSession, request: dict[str, Any]) -> ModuleResources:
-        name = session.link.name
         quick = request.get("what") in (LIST, LOG)
-        try:
-            timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
-            value = await self._bridge.rpc.request(session, LAUNCH, request, timeout)
-            return msgspec.structs.replace(msgspec.convert(value, ModuleResources), module=name)
-        except (RmpaError, msgspec.ValidationError) as error:
-            problem, code = why_unanswered(error, _EARLIER)
-        return ModuleResources(module=name, problem=problem, code=code)
+        timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
+        return await self._bridge.rpc.ask(session, LAUNCH, request, ModuleResources, timeout)
 
     async def _do(
         self, args: Mapping[str, Any], allowed: Callable[[str], bool] = lambda _name: True, peer: str = ""
@@ -369,3 +336,9 @@ class Launcher(Part):
             if self._is_active(one.name, await asyncio.to_thread(load_runs, self._state)):
                 return
             await asyncio.sleep(_LOOK)
+
+
+def _load_notes(state: Path) -> dict[str, ProgramNote]:
+    """The notes of the programs that run, by the names of their resources; reads the disk."""
+    notes = {path.name[1:-5]: ProgramNote.load(path) for path in (state / RUNS).glob(".*.json")}
+    return {name: note for name, note in notes.items() if note is not None and note.mark.runs}

@@ -21,12 +21,12 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import why_unanswered
+from rmpa.bridge.rpc import meant
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.identity import is_meant
+from rmpa.core.facts import ModuleAnswer
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -44,25 +44,18 @@ REMOVE: Final = "record.remove"
 _SECOND: Final = 1_000_000_000
 # For permissions: stands for all recordings, where a peer asks what the recorder does.
 _ANY: Final = "/*"
-_EARLIER: Final = "its agent is of an earlier release, which has no recordings; install this release there"
 
 
-class ModuleRecordings(msgspec.Struct, frozen=True, kw_only=True):
+class ModuleRecordings(ModuleAnswer, frozen=True, kw_only=True):
     """The recordings of one module.
 
     Attributes:
-        module: Its name.
         kept: What it has kept, oldest first.
         status: What its recorder does (``record.recorder.RecorderStatus``); empty: none runs.
-        problem: Why it does not tell.
-        code: Of that, by ``core.codes``.
     """
 
-    module: str
     kept: tuple[Kept, ...] = ()
-    status: dict[str, Any] = {}
-    problem: str = ""
-    code: str = ""
+    status: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class FilePart(msgspec.Struct, frozen=True):
@@ -161,7 +154,7 @@ class Recordings(Part):
             why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept), "now": now})
         except PeerRefused as error:
             done.add(session.link.name)
-            return _EARLIER if error.unknown else error.reason
+            return error.reason
         except RmpaError as error:
             return str(error)
         done.add(session.link.name)
@@ -198,7 +191,7 @@ class Recordings(Part):
         name = self._bridge.context.settings.name
         if folder is None or not folder.is_dir():
             return ModuleRecordings(module=name)
-        status: dict[str, Any] = {}
+        status: dict[str, Any] = msgspec.field(default_factory=dict)
         with contextlib.suppress(OSError, msgspec.DecodeError):  # no recorder has run
             status = msgspec.json.decode((folder / "status.json").read_bytes(), type=dict[str, Any])
         problem = ""
@@ -210,17 +203,9 @@ class Recordings(Part):
 
     async def list(self) -> list[ModuleRecordings]:
         """The recordings of this module and of its peers."""
-        peers = [*self._bridge.sessions.linked()]
+        rpc, peers = self._bridge.rpc, [*self._bridge.sessions.linked()]
         own = await asyncio.to_thread(self._here)
-        return [own, *await asyncio.gather(*map(self._list_of, peers))]
-
-    async def _list_of(self, session: PeerSession) -> ModuleRecordings:
-        try:
-            found = msgspec.convert(await self._bridge.rpc.request(session, LIST, {}), ModuleRecordings)
-            return msgspec.structs.replace(found, module=session.link.name)
-        except (RmpaError, msgspec.ValidationError) as error:
-            problem, code = why_unanswered(error, _EARLIER)
-        return ModuleRecordings(module=session.link.name, problem=problem, code=code)
+        return [own, *await asyncio.gather(*(rpc.ask(peer, LIST, {}, ModuleRecordings) for peer in peers))]
 
     async def _read(self, asker: PeerSession, args: dict[str, Any]) -> FilePart:
         return await asyncio.to_thread(self._part, self._check(asker, args.get("id")), args)
@@ -278,8 +263,7 @@ class Recordings(Part):
             if request == REMOVE:
                 return await asyncio.to_thread(remove_kept, self._kept(), str(args.get("id", "")))
             return await asyncio.to_thread(self._part, check_id(str(args.get("id", ""))), args)
-        sessions = [s for s in self._bridge.sessions.linked() if is_meant(module, s.link.name, str(s.link.guid))]
-        if not sessions:
+        if not (sessions := meant(self._bridge.sessions.linked(), module)):
             raise RmpaError(f"{module} is not linked; `rmpa peer list` shows why", code="peer-unlinked")
         inner = {key: args[key] for key in ("id", "file", "offset", "size", "check") if key in args}
         return await self._bridge.rpc.request(sessions[0], request, inner, limits.RECORDING_TIMEOUT)
