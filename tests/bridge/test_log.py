@@ -199,7 +199,7 @@ async def test_a_peer_reads_and_sets_the_log_of_the_nodes_that_a_permission_name
     with pytest.raises(RmpaError, match="do not let arm use the log of /secret"):
         await level(asker(), {"node": "/secret", "level": "debug"})
     with pytest.raises(RmpaError, match="base has no node /no"):
-        await module.logs.level({"node": "/no"})
+        await module.logs.level(None, {"node": "/no"})
     with pytest.raises(RmpaError, match="/talker has no loggers"):  # it is permitted
         await level(asker(), {"node": "/talker"})
     await module.logs.close()

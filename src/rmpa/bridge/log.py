@@ -85,7 +85,7 @@ class ModuleLogs(Part):
         self._handler: _Records | None = None
         self._subscription: Subscription | None = None
         bridge.rpc.on_request(LINES, self._lines, Needs((Access.LOG,), "each line's node; others are left out"))
-        bridge.rpc.on_request(LEVEL, self._level, Needs((Access.LOG,), "the node"))
+        bridge.rpc.on_request(LEVEL, self.level, Needs((Access.LOG,), "the node"))
 
     def start(self) -> None:
         """Begin to keep lines."""
@@ -149,17 +149,12 @@ class ModuleLogs(Part):
         self._core.call("registerSubscriber", OWN_NODE, subscription.topic, LOG.type, self._bridge.node.uri)
         subscription.update(list(self._core.publishers(subscription.topic).values()))
 
-    def _lines(self, asker: PeerSession, args: dict[str, Any]) -> ModuleLog:
-        query, peer, gate = LogQuery.of(args), asker.link.name, self._bridge.context.gate
-        if not gate.on:
-            return self._find(query)
-        allowed = {node for node in self.ring.nodes if gate.judge(Access.LOG, peer, node).allowed}
+    def _lines(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleLog:
+        query, (gate, peer) = LogQuery.of(args), self._bridge.context.gate_for(asker)
+        allowed = {node for node in self.ring.nodes if not gate.on or gate.judge(Access.LOG, peer, node).allowed}
         if not allowed and (why := gate.why_not(Access.LOG, peer, query.node or OWN_NODE)):
             raise RmpaError(why, code="not-permitted")
         return self.ring.find(query, time.time_ns(), allowed.__contains__, yielding_to_data)
-
-    def _find(self, query: LogQuery) -> ModuleLog:
-        return self.ring.find(query, time.time_ns(), yielder=yielding_to_data)
 
     async def read(self, args: Mapping[str, Any]) -> list[ModuleLog]:
         """Log lines of this module and of its peers, which are asked at one time.
@@ -173,16 +168,16 @@ class ModuleLogs(Part):
         """
         args = dict(args)
         wanted, after = args.pop("modules", None), args.pop("after", None)
-        query, own, sessions = LogQuery.of(args), self._bridge.context.settings.name, [*self._bridge.sessions]
+        query = msgspec.to_builtins(LogQuery.of(args))
+        own, sessions = self._bridge.context.settings.name, [*self._bridge.sessions]
 
         async def of(name: str, session: PeerSession | None) -> ModuleLog:
             number = after.get(name) if isinstance(after, dict) else None
-            known = isinstance(number, int) and number >= 0
-            its = msgspec.structs.replace(query, after=number) if known else query
+            its = query | ({"after": number} if isinstance(number, int) and number >= 0 else {})
             if session is not None:
                 return await self._ask(session, its)
             if name == own:
-                return msgspec.structs.replace(self._find(its), module=own, error=0.0)
+                return msgspec.structs.replace(self._lines(None, its), module=own, error=0.0)
             error = no_such_module(name, own, sessions)
             return ModuleLog(module=name, problem=str(error), code=error.code)
 
@@ -193,32 +188,24 @@ class ModuleLogs(Part):
             asked += [(own, None)] if name == own else found or [(name, None)]
         return await asyncio.gather(*(of(*each) for each in asked))
 
-    async def _ask(self, session: PeerSession, query: LogQuery) -> ModuleLog:
+    async def _ask(self, session: PeerSession, query: dict[str, Any]) -> ModuleLog:
         """The lines of a peer."""
         if not session.linked:
             text = "it is silent: there is no link to it now"
             return ModuleLog(module=session.link.name, problem=text, code="peer-unlinked")
-        clock, args = session.time, msgspec.to_builtins(query)
-        found = await self._bridge.rpc.ask(session, LINES, args, ModuleLog, limits.LOG_ASK_TIMEOUT)
-        ahead, bound = clock.ahead_ns / 1e9, clock.error_ns
+        found = await self._bridge.rpc.ask(session, LINES, query, ModuleLog, limits.LOG_ASK_TIMEOUT)
+        ahead, bound = session.time.ahead_ns / 1e9, session.time.error_ns
         lines = (msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
         error = None if bound is None or found.problem else bound / 1e9
         return msgspec.structs.replace(found, lines=(*lines,), error=error)
 
-    async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
-        peer = asker.link.name
-        nodes = permitted_nodes(self._bridge, Access.LOG, peer, args)
-        return await self._loggers(args, nodes, asker_name(peer))
-
-    async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
+    async def level(self, asker: PeerSession | None, args: Mapping[str, Any]) -> dict[str, str]:
         """The levels of the loggers of a ``node`` of this module, by name; with ``level``: those that were set to it.
 
         Raises:
-            RmpaError: There is no such node, level or logger, or it does not answer.
+            RmpaError: There is no such node, level or logger, or it does not answer, or the asker may not.
         """
-        return await self._loggers(args, None, "this module")
-
-    async def _loggers(self, args: Mapping[str, Any], nodes: list[str] | None, who: str) -> dict[str, str]:
+        nodes = permitted_nodes(self._bridge, Access.LOG, asker, args)
         node, api = own_node(self._bridge, args, nodes, agents=True)
         uri = self._core.registrations.service_uri(f"{node}/get_loggers")
         if uri is None:
@@ -227,9 +214,6 @@ class ModuleLogs(Part):
         if not level:
             return await read_levels(uri, api, node, OWN_NODE)
         levels = await set_level(uri, node, OWN_NODE, logger, level)
+        who = asker_name(asker.link.name) if asker is not None else "this module"
         _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels
-
-
-def _since(query: LogQuery, after: object) -> LogQuery:
-    return msgspec.structs.replace(query, after=after) if isinstance(after, int) and after >= 0 else query

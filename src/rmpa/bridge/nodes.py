@@ -111,9 +111,9 @@ class Nodes(Part):
         rpc = bridge.rpc
         rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
         rpc.on_request(LIST, self._list, _VISIBLE)
-        rpc.on_request(NODE_INFO, self._info, _VISIBLE)
+        rpc.on_request(NODE_INFO, self.info, _VISIBLE)
         rpc.on_request(PING, self._ping, _VISIBLE)
-        rpc.on_request(TOP, lambda asker, _args: self.top(asker.link.name), _VISIBLE)
+        rpc.on_request(TOP, self.top, _VISIBLE)
         rpc.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
 
     async def close(self) -> None:
@@ -165,8 +165,7 @@ class Nodes(Part):
         ]
         most = self._bridge.context.settings.limits.nodes
         for session in self._bridge.sessions.linked():
-            peer = session.link.name
-            visible = self._visible(peer)
+            peer, visible = session.link.name, self._visible(session)
             names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[:most])
             if names != self._told.get(session.peer):  # over a new link also that there are none any more
                 self._told[session.peer] = names
@@ -208,15 +207,15 @@ class Nodes(Part):
 
     def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         problems = {node: found.problem for node, found in self._core.unreachable().items()}
-        found = list_nodes(*self._tables(asker.link.name), self._core.state().nodes, problems, yielding_to_data)
+        found = list_nodes(*self._tables(asker), self._core.state().nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    def _tables(self, peer: str = "") -> tuple[_Table, _Table, _Table]:
-        """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
-        state, gate = self._core.state(), self._bridge.context.gate
+    def _tables(self, asker: PeerSession | None) -> tuple[_Table, _Table, _Table]:
+        """The nodes by published topic, by subscribed topic and by service: by those that the asker may have."""
+        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
 
         def permitted(access: Access, table: _Table) -> _Table:
-            if not peer or not gate.on:
+            if not gate.on:
                 return table
             rows = yielding_to_data(list(table.items()))
             return {name: nodes for name, nodes in rows if gate.judge(access, peer, name).allowed}
@@ -227,35 +226,28 @@ class Nodes(Part):
             permitted(Access.CALL, state.services),
         )
 
-    def _visible(self, peer: str) -> Collection[str]:
-        """The nodes that a peer is told of: those of which it may have something."""
-        if not self._bridge.context.gate.on:
+    def _visible(self, asker: PeerSession | None) -> Collection[str]:
+        """The nodes that the asker is told of: those of which it may have something."""
+        if not self._bridge.context.gate_for(asker)[0].on:
             return self._core.state().nodes
-        return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
+        return {node for table in self._tables(asker) for nodes in yielding_to_data(table.values()) for node in nodes}
 
-    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
-        return await self.info(args, asker.link.name)
-
-    async def info(self, args: Mapping[str, object], peer: str = "") -> NodeFacts:
-        """The facts about the ``node`` of this module that a request names.
-
-        Args:
-            args: The request's.
-            peer: A peer that asks, which is not told the names of what it may not have; empty: this module.
+    async def info(self, asker: PeerSession | None, args: Mapping[str, object]) -> NodeFacts:
+        """The facts about the ``node`` of this module that a request names, as far as its asker may know them.
 
         Raises:
             RmpaError: There is no such node.
         """
-        node, uri = own_node(self._bridge, args, self._visible(peer) if peer else None)
-        state, gate = self._core.state(), self._bridge.context.gate
-        facts = describe_node(node, uri, *self._tables(peer), state.types)
+        node, uri = own_node(self._bridge, args, self._visible(asker))
+        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
+        facts = describe_node(node, uri, *self._tables(asker), state.types)
         try:
             answer = await ping_node(node, uri, OWN_NODE)
         except RmpaError as error:
             return msgspec.structs.replace(facts, problem=str(error))
         names = {address: name for name, address in state.nodes.items()}
         connections = await node_connections(uri, OWN_NODE, names)
-        if peer and connections is not None:
+        if connections is not None:
             connections = tuple(
                 one
                 for one in connections
@@ -263,14 +255,10 @@ class Nodes(Part):
             )
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
 
-    async def top(self, peer: str = "") -> tuple[NodeCost, ...]:
-        """What the processes of this module's nodes cost; nodes of other machines have none here.
-
-        Args:
-            peer: A peer that asks, which is told only of what it may have; empty: this module.
-        """
+    async def top(self, asker: PeerSession | None, _args: Mapping[str, object]) -> tuple[NodeCost, ...]:
+        """What the processes of this module's nodes cost that the asker may know of; those elsewhere have none here."""
         known, launch = self._core.state().nodes, self._bridge.launch
-        names = self._visible(peer) if peer else known
+        names = self._visible(asker)
         asked = [(name, known[name]) for name in sorted(names) if name in known and not is_own(name)]
         turns, starters = asyncio.Semaphore(limits.TOP_AT_ONCE), await launch.starters()
 
@@ -315,12 +303,12 @@ class Nodes(Part):
         )
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
-        node, uri = own_node(self._bridge, args, self._visible(asker.link.name))
+        node, uri = own_node(self._bridge, args, self._visible(asker))
         return await ping_node(node, uri, OWN_NODE)
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, bool]:
         peer = asker.link.name
-        node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, peer, args))
+        node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, asker, args))
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
         if not matches_any(self._bridge.context.settings.nodes.kill, node):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
@@ -334,47 +322,45 @@ class Nodes(Part):
         return {"gone": gone}
 
 
-def permitted_nodes(bridge: Bridge, access: Access, peer: str, args: Mapping[str, object]) -> list[str]:
-    """The nodes of this module with which a peer may do something.
+def permitted_nodes(
+    bridge: Bridge, access: Access, asker: PeerSession | None, args: Mapping[str, object]
+) -> list[str]:
+    """The nodes of this module with which an asker may do something.
 
     Raises:
         RmpaError: It may not with the ``node`` of its request, whether there is one or not.
     """
-    gate, named = bridge.context.gate, str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+    (gate, peer), named = bridge.context.gate_for(asker), str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
     if why := gate.why_not(access, peer, named):
         raise RmpaError(why, code="not-permitted")
     return [node for node in bridge.core.state().nodes if gate.judge(access, peer, node).allowed]
 
 
 def own_node(
-    bridge: Bridge, args: Mapping[str, object], told: Collection[str] | None, *, agents: bool = False
+    bridge: Bridge, args: Mapping[str, object], told: Collection[str], *, agents: bool = False
 ) -> tuple[str, str]:
     """The node of this module that a request names, and its slave API.
 
     Args:
         bridge: Its core.
         args: The request's.
-        told: The nodes that may be told of; ``None``: all.
+        told: The nodes that may be told of.
         agents: Whether the agent's own node counts.
 
     Raises:
         RmpaError: There is no such node.
     """
-    here = bridge.context.settings.name
-    node = args.get("node")
+    here, node, nodes = bridge.context.settings.name, args.get("node"), bridge.core.state().nodes
     if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
         raise RmpaError("the question names no node")
     if is_own(node) and not (agents and node == OWN_NODE):
         origin = proxied_node(node)
         whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
         raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
-    nodes = bridge.core.state().nodes
-    known = nodes if told is None else told
-    if node not in known or node not in nodes:
-        near = did_you_mean(node, [name for name in known if not is_own(name)])
-        raise RmpaError(
-            f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""), code="unknown-name"
-        )
+    if node not in told or node not in nodes:
+        near = did_you_mean(node, [name for name in told if not is_own(name)])
+        hint = f"; did you mean {near}?" if near else ""
+        raise RmpaError(f"{here} has no node {node}{hint}", code="unknown-name")
     return node, nodes[node]
 
 

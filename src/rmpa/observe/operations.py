@@ -133,7 +133,7 @@ class ControlOperations:
         """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
         if peer is None and what == node_requests.NODE_INFO:
-            return await self.nodes.info(args)
+            return await self.nodes.info(None, args)
         if peer is None:
             return await asyncio.gather(*map(self._nodes_of, self.facts.bridge.sessions.linked()))
         session = self._session(peer)
@@ -177,7 +177,7 @@ class ControlOperations:
             if names is None or any(is_meant(name, session.link.name, str(session.link.guid)) for name in names)
         ]
         told = await self._of_peers(peers, node_requests.TOP)
-        return ({self.name: await self.nodes.top()} if names is None or self.name in names else {}) | told
+        return ({self.name: await self.nodes.top(None, {})} if names is None or self.name in names else {}) | told
 
     async def _of_peers(self, peers: list[PeerSession], what: str) -> dict[str, Any]:
         """The answers of peers to a request, by name; a text where one does not give any."""
@@ -194,7 +194,7 @@ class ControlOperations:
         """The levels of a ``node``'s loggers; ``level``: sets that of a ``logger``. ``peer``: the node's module."""
         request = {name: str(args[name]) for name in ("node", "logger", "level") if args.get(name)}
         if not (peer := args.get("peer")):
-            return await self.facts.bridge.log.level(request)
+            return await self.facts.bridge.log.level(None, request)
         return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
 
     async def record(self, args: Args) -> Any:
