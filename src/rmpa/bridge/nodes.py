@@ -256,7 +256,7 @@ class Nodes(Part):
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
 
     async def top(self, asker: PeerSession | None, _args: Mapping[str, object]) -> tuple[NodeCost, ...]:
-        """What the processes of this module's nodes cost that the asker may know of; those elsewhere have none here."""
+        """What the processes of this module's nodes cost, of those that the asker may know of and that run here."""
         known, launch = self._core.state().nodes, self._bridge.launch
         names = self._visible(asker)
         asked = [(name, known[name]) for name in sorted(names) if name in known and not is_own(name)]

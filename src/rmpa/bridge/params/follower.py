@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
-from rmpa.bridge.params.transfer import follow_rules
+from rmpa.bridge.params.owner import FOLLOW, VALUE, ParamCore, ParamOwner, follow_rules, read_text, text_of
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
@@ -93,7 +91,7 @@ class Params(Part):
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
         own = Needs((), "what `[[param]]` follows from this very peer")
-        bridge.rpc.on_request(transfer.VALUE, self._told, own)
+        bridge.rpc.on_request(VALUE, self._told, own)
 
     def notes(self) -> tuple[str, ...]:
         """Messages to the user about parameters that are not followed although their owner is linked."""
@@ -195,7 +193,7 @@ class Params(Part):
         mine = [entry for entry in self.followed if entry.peer == session.peer]
         keys = [entry.rule.key for entry in mine]
         try:
-            answer = await self._bridge.rpc.request(session, transfer.FOLLOW, {"keys": keys})
+            answer = await self._bridge.rpc.request(session, FOLLOW, {"keys": keys})
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
@@ -218,7 +216,7 @@ class Params(Part):
         """
         text, refused = args.get("text"), args.get("refused")
         if text is not None:
-            transfer.text_of(args)
+            text_of(args)
         for entry in self.followed:
             if (entry.peer, entry.rule.key) != (session.peer, args.get("key")):
                 continue
