@@ -15,7 +15,7 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from rmpa.config.values import BadValue, JsonSchema, ValueType, read_at, shown
+from rmpa.config.values import BOOL, BadValue, JsonSchema, ValueType, read_at, shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -128,6 +128,18 @@ def setting(
     it = Setting(value_type, help, default, (), env, option, shown_default, live)
     made: _T = field(default=default, metadata={"setting": it, "key": key})
     return made
+
+
+def switch(
+    help: str,  # noqa: A002 - as of ``setting``
+    *,
+    default: bool = False,
+    key: str | None = None,
+    option: str = "",
+    live: bool = False,
+) -> bool:
+    """Declare a setting that is true or false; the arguments are those of ``setting``."""
+    return setting(default, BOOL, help, key=key, option=option, live=live)
 
 
 def table(kind: type[_T], name: str, env: str = "", *, live: bool = False, command: str = "up") -> _T:

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits, peer_rules
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
-from rmpa.config.schema import setting, settings_of, table
+from rmpa.config.schema import setting, settings_of, switch, table
 from rmpa.config.values import (
-    BOOL,
     BOUND,
     BYTES_A_SECOND,
     DOMAIN,
@@ -65,7 +64,7 @@ class ServiceSettings:
 
     allow: tuple[str, ...] = setting(("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.")
     deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that do not cross.")
-    loggers: bool = setting(False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.")
+    loggers: bool = switch("Whether each node's get_loggers and set_logger_level cross too.")
     timeout: float = setting(
         limits.SERVICE_TIMEOUT,
         TIMEOUT,
@@ -104,10 +103,8 @@ class ResourceSettings:
         "~/.config/rmpa/resources; no other user may write there.",
         shown_default="none: nothing is started",
     )
-    start: bool = setting(True, BOOL, "Start those with boot = true in their table [start].")
-    open: bool = setting(
-        False,
-        BOOL,
+    start: bool = switch("Start those with boot = true in their table [start].", default=True)
+    open: bool = switch(
         "In a mesh that is not secured every program in the network may then start, stop and read what is in the "
         "folder; in a secured mesh a [[permission]] with launch says who may.",
         live=True,
@@ -130,7 +127,7 @@ class TimeSettings:
     """Simulated time (``/use_sim_time`` and ``/clock``) across modules."""
 
     follow: str = setting("", NAME_OR_EMPTY, "The peer whose simulated time is used here; empty: none.")
-    share: bool = setting(False, BOOL, "Whether peers may follow this module's time.")
+    share: bool = switch("Whether peers may follow this module's time.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +164,7 @@ class LaneSettings:
 class RealtimeSettings:
     """Requests to the kernel for real-time behaviour; refusals are logged."""
 
-    enabled: bool = setting(False, BOOL, "Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
+    enabled: bool = switch("Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
     priority: int = setting(
         50,
         whole_number(1, 99, "a priority of SCHED_FIFO"),
@@ -180,9 +177,7 @@ class RealtimeSettings:
 class WebSettings:
     """Where ``rmpa web`` serves, and whether the agent starts it."""
 
-    enabled: bool = setting(
-        False, BOOL, "Start rmpa web with the agent, and restart it if it ends.", option="--web/--no-web"
-    )
+    enabled: bool = switch("Start rmpa web with the agent, and restart it if it ends.", option="--web/--no-web")
     port: int = setting(8480, PORT, "The port of rmpa web.")
     listen: str = setting(
         "127.0.0.1", HOST, "The address that rmpa web listens at; beyond this machine clients need a token."
@@ -202,19 +197,14 @@ class WebSettings:
     origins: tuple[str, ...] = setting(
         (), list_of(TEXT), "Pages of other sites that may connect, such as https://app.foxglove.dev.", live=True
     )
-    control: bool = setting(
-        False,
-        BOOL,
-        "Let clients publish, call and offer services, and set parameters; they then need the token.",
-        live=True,
+    control: bool = switch(
+        "Let clients publish, call and offer services, and set parameters; they then need the token.", live=True
     )
     cert: str = setting(
         "", TEXT, "Serve HTTPS with this certificate: a PEM file, the intermediate certificates behind it."
     )
     key: str = setting("", TEXT, "The certificate's private key: a PEM file; empty: it is in the certificate's file.")
-    drive: bool = setting(
-        False, BOOL, "Let the monitor's joystick command a robot; clients then need the token.", live=True
-    )
+    drive: bool = switch("Let the monitor's joystick command a robot; clients then need the token.", live=True)
     command_age_ms: int = setting(
         0,
         whole_number(0, 60_000, "milliseconds (0: any age)", "MS"),
@@ -232,8 +222,8 @@ ALARM, PEER_LOST, NODE_DIED, CONTRACT = "alarm", "peer_lost", "node_died", "cont
 class RecordSettings:
     """What ``rmpa record`` keeps of the last minutes, and whether the agent starts it."""
 
-    enabled: bool = setting(
-        False, BOOL, "Start rmpa record with the agent, and restart it if it ends.", option="--record/--no-record"
+    enabled: bool = switch(
+        "Start rmpa record with the agent, and restart it if it ends.", option="--record/--no-record"
     )
     topics: tuple[str, ...] = setting(("/**",), list_of(TOPIC_GLOB), "Topics of this module's nodes to record.")
     deny: tuple[str, ...] = setting((), list_of(TOPIC_GLOB), "Topics that are not recorded.", shown_default="none")
@@ -296,16 +286,12 @@ class TrustSettings:
         "Modules that may pass on what others offer; the origin that they name cannot be proved.",
         live=True,
     )
-    direct: bool = setting(
-        False,
-        BOOL,
+    direct: bool = switch(
         "Let nodes connect directly to those of other machines although nothing protects these connections.",
         live=True,
     )
-    require: bool = setting(False, BOOL, "Refuse to start while this module has not joined a secured mesh.")
-    insecure: bool = setting(
-        False,
-        BOOL,
+    require: bool = switch("Refuse to start while this module has not joined a secured mesh.")
+    insecure: bool = switch(
         "Start without trust although other modules here have keys; a module with its own keys is secured anyway.",
         option="--insecure",
     )
@@ -415,17 +401,13 @@ class Settings:
         key="bridge.transport",
         live=True,
     )
-    prefix_peers: bool = setting(
-        False,
-        BOOL,
+    prefix_peers: bool = switch(
         "Put each peer's name before its names here (/arm/odom of arm): for robots that use the same names.",
         key="bridge.prefix_peers",
         option="--prefix-peers",
         live=True,
     )
-    rosout: bool = setting(
-        False,
-        BOOL,
+    rosout: bool = switch(
         "Whether /rosout crosses; both modules need it. `rmpa log` shows the log of all modules without it.",
         key="bridge.rosout",
         live=True,
@@ -456,8 +438,8 @@ class Settings:
     record: RecordSettings = table(RecordSettings, "record", "RECORD")
     trust: TrustSettings = table(TrustSettings, "trust", "TRUST")
     gateway: GatewaySettings = table(GatewaySettings, "gateway", "GATEWAY", command="gateway")
-    relay: bool = setting(
-        False, BOOL, "Offer what comes from one peer to others that do not reach it themselves.", key="relay.enabled"
+    relay: bool = switch(
+        "Offer what comes from one peer to others that do not reach it themselves.", key="relay.enabled"
     )
     control_group: str = setting(
         "",
@@ -479,7 +461,7 @@ class Settings:
         option="--log-level",
         live=True,
     )
-    log_json: bool = setting(False, BOOL, "Log one JSON object a line.", key="log.json", option="--log-json")
+    log_json: bool = switch("Log one JSON object a line.", key="log.json", option="--log-json")
     runtime_dir: str = setting(
         "", TEXT, "The directory of the control sockets.", key="", shown_default="this user's runtime directory"
     )
