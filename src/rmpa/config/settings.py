@@ -170,7 +170,7 @@ class RealtimeSettings:
         whole_number(1, 99, "a priority of SCHED_FIFO"),
         "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
     )
-    lock_memory: bool = setting(True, BOOL, "Keep the agent's memory in RAM (mlockall).")
+    lock_memory: bool = switch("Keep the agent's memory in RAM (mlockall).", default=True)
 
 
 @dataclass(frozen=True, slots=True)
