@@ -350,16 +350,13 @@ def load_runs(directory: Path) -> dict[str, ResourceRun]:
 def _processes(runs: Sequence[ResourceRun], shares: CpuShares) -> Iterator[LaunchedProcess]:
     for node in (node for run in runs for node in run.nodes):
         about = figures(node.pid) if node.pid else None
+        state = node.state if about is not None or node.state != "running" else "stopped"
         told = LaunchedProcess(
-            node=node.node,
-            restarts=node.restarts,
-            state=node.state if about is not None or node.state != "running" else "stopped",
-            own=node.mark is not None,
-            why=node.why,
+            node=node.node, restarts=node.restarts, state=state, own=node.mark is not None, why=node.why
         )
         if about is not None:
-            cpu = shares.of(node.pid, about)
+            cpu, since = shares.of(node.pid, about), node.since
             told = msgspec.structs.replace(
-                told, pid=node.pid, cpu=cpu, rss=about.rss, threads=about.threads, since=node.since
+                told, pid=node.pid, cpu=cpu, rss=about.rss, threads=about.threads, since=since
             )
         yield told

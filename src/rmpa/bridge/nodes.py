@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from typing import TYPE_CHECKING, Any, Final
@@ -257,49 +258,41 @@ class Nodes(Part):
 
     async def top(self, asker: PeerSession | None, _args: Mapping[str, object]) -> tuple[NodeCost, ...]:
         """What the processes of this module's nodes cost, of those that the asker may know of and that run here."""
-        known, launch = self._core.state().nodes, self._bridge.launch
-        names = self._visible(asker)
-        asked = [(name, known[name]) for name in sorted(names) if name in known and not is_own(name)]
+        state, launch = self._core.state(), self._bridge.launch
+        asked = [name for name in sorted(self._visible(asker)) if name in state.nodes and not is_own(name)]
         turns, starters = asyncio.Semaphore(limits.TOP_AT_ONCE), await launch.starters()
+        here = {
+            *local_addresses(),
+            socket.gethostname(),
+        }  # the names under which nodes of this machine are registered
 
-        async def pid(name: str, uri: str) -> int | None:
+        async def process(name: str) -> int | None:
+            uri = state.nodes[name]
+            if not is_loopback(host_of(uri)) and host_of(uri) not in here:
+                return None
             async with turns:
-                try:
+                with contextlib.suppress(RmpaError, TimeoutError):
                     async with asyncio.timeout(limits.TOP_ANSWER):
                         return (await ping_node(name, uri, OWN_NODE)).pid
-                except (RmpaError, TimeoutError):
-                    return None
+            return None
 
-        here = [is_loopback(host_of(uri)) or host_of(uri) in self._hosts() for _, uri in asked]
-        pids = await asyncio.gather(*(pid(*one) for one in asked))
-        pids = [each if local else None for each, local in zip(pids, here, strict=True)]
-        running = {each for each in pids if each is not None}
+        pids = dict(zip(asked, await asyncio.gather(*map(process, asked)), strict=True))
+        running = {pid for pid in pids.values() if pid is not None}
         launch.shares.keep(running)
         if not all(map(launch.shares.known, running)):
-            for each in running:
-                if (about := figures(each)) is not None:
-                    launch.shares.of(each, about)
+            for pid in running:
+                if (about := figures(pid)) is not None:
+                    launch.shares.of(pid, about)
             await asyncio.sleep(limits.TOP_FIRST)
-        return tuple(
-            self._cost(name, each, starters.get(name, "")) for (name, _), each in zip(asked, pids, strict=True)
-        )
-
-    def _hosts(self) -> list[str]:
-        """The names under which nodes of this machine are registered."""
-        return [*local_addresses(), socket.gethostname()]
+        return tuple(self._cost(name, pid, starters.get(name, "")) for name, pid in pids.items())
 
     def _cost(self, node: str, pid: int | None, started_by: str) -> NodeCost:
         about = figures(pid) if pid is not None else None
         if pid is None or about is None:
             return NodeCost(node=node, started_by=started_by)
+        cpu, since = self._bridge.launch.shares.of(pid, about), about.since
         return NodeCost(
-            node=node,
-            pid=pid,
-            cpu=self._bridge.launch.shares.of(pid, about),
-            rss=about.rss,
-            threads=about.threads,
-            since=about.since,
-            started_by=started_by,
+            node=node, pid=pid, cpu=cpu, rss=about.rss, threads=about.threads, since=since, started_by=started_by
         )
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
