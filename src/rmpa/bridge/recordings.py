@@ -171,20 +171,22 @@ class Recordings(Part):
         )
         return await self._keep_here(moved)
 
-    def _check(self, asker: PeerSession, name: object) -> str:
-        kept = check_id(str(name))
-        if why := self._bridge.context.gate.why_not(Access.RECORD, asker.link.name, f"/{kept}"):
+    def _check(self, asker: PeerSession | None, name: object) -> str:
+        kept, (gate, peer) = check_id(str(name)), self._bridge.context.gate_for(asker)
+        if why := gate.why_not(Access.RECORD, peer, f"/{kept}"):
             raise RmpaError(why, code="not-permitted")
         return kept
 
-    async def _list(self, asker: PeerSession, _args: dict[str, Any]) -> ModuleRecordings:
-        gate, peer = self._bridge.context.gate, asker.link.name
+    async def _list(self, asker: PeerSession | None, _args: Mapping[str, Any]) -> ModuleRecordings:
+        gate, peer = self._bridge.context.gate_for(asker)
         found = await asyncio.to_thread(self._here)
         kept = tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
         why = gate.why_not(Access.RECORD, peer, _ANY)  # it names the topics
         if why and not kept:
             raise RmpaError(why, code="not-permitted")
-        return msgspec.structs.replace(found, kept=kept, **({"status": {}, "problem": "", "code": ""} if why else {}))
+        if why:
+            return ModuleRecordings(module=found.module, kept=kept)
+        return msgspec.structs.replace(found, kept=kept)
 
     def _here(self) -> ModuleRecordings:
         folder = self.folder
@@ -204,11 +206,11 @@ class Recordings(Part):
     async def list(self) -> list[ModuleRecordings]:
         """The recordings of this module and of its peers."""
         rpc, peers = self._bridge.rpc, [*self._bridge.sessions.linked()]
-        own = await asyncio.to_thread(self._here)
+        own = await self._list(None, {})
         return [own, *await asyncio.gather(*(rpc.ask(peer, LIST, {}, ModuleRecordings) for peer in peers))]
 
-    async def _read(self, asker: PeerSession, args: dict[str, Any]) -> FilePart:
-        return await asyncio.to_thread(self._part, self._check(asker, args.get("id")), args)
+    async def _read(self, asker: PeerSession | None, args: Mapping[str, Any]) -> FilePart:
+        return await asyncio.to_thread(self._part, self._check(asker, args.get("id", "")), args)
 
     def _part(self, name: str, args: Mapping[str, Any]) -> FilePart:
         """A part of a file of a recording of this module.
@@ -240,8 +242,8 @@ class Recordings(Part):
             raise RmpaError("there is no state directory; set RMPA_STATE_DIR", code="no-state-directory")
         return folder / KEPT
 
-    async def _remove(self, asker: PeerSession, args: dict[str, Any]) -> Kept:
-        return await asyncio.to_thread(remove_kept, self._kept(), self._check(asker, args.get("id")))
+    async def _remove(self, asker: PeerSession | None, args: Mapping[str, Any]) -> Kept:
+        return await asyncio.to_thread(remove_kept, self._kept(), self._check(asker, args.get("id", "")))
 
     async def answer(self, args: Mapping[str, Any]) -> Any:
         """What a command asks: ``what`` is keep, list, read or remove, of the ``module`` (without one: this one).
@@ -250,21 +252,18 @@ class Recordings(Part):
             RmpaError: It cannot be done.
         """
         what, module = str(args.get("what", "list")), str(args.get("module", ""))
-        own = self._bridge.context.settings.name
         if what == "list":
             return await self.list()
         if what == "keep":
             only = args.get("modules", ())
             return await self.keep(self._made(args), [str(each) for each in only] if isinstance(only, list) else ())
-        request = {"read": READ, "remove": REMOVE}.get(what)
-        if request is None:
+        if what not in ("read", "remove"):
             raise RmpaError(f"{what!r} is no question about recordings", code="unknown-name")
-        if module in ("", own):
-            if request == REMOVE:
-                return await asyncio.to_thread(remove_kept, self._kept(), str(args.get("id", "")))
-            return await asyncio.to_thread(self._part, check_id(str(args.get("id", ""))), args)
+        if module in ("", self._bridge.context.settings.name):
+            return await (self._read if what == "read" else self._remove)(None, args)
         if not (sessions := meant(self._bridge.sessions.linked(), module)):
             raise RmpaError(f"{module} is not linked; `rmpa peer list` shows why", code="peer-unlinked")
+        request = READ if what == "read" else REMOVE
         inner = {key: args[key] for key in ("id", "file", "offset", "size", "check") if key in args}
         return await self._bridge.rpc.request(sessions[0], request, inner, limits.RECORDING_TIMEOUT)
 
