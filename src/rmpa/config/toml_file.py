@@ -44,59 +44,38 @@ def value_at(table: object, place: Place) -> object:
 _PIECE: Final = re.compile(
     r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{\]}]|\n""", re.DOTALL
 )
+_CLOSES: Final = {"[": "]", "{": "}"}
 
 
-def _line_ends(text: str) -> Iterator[tuple[int, int]]:
-    """Each end of a line outside strings in a valid TOML text: the line's number, from 1, and the open brackets."""
-    line = depth = 0
+def _line_ends(text: str) -> Iterator[tuple[int, str]]:
+    """Each end of a line outside strings in a valid TOML text: the line's number, and what closes what is open."""
+    line, closing = 0, ""
     for match in _PIECE.finditer(text):
         piece = match[0]
-        depth += (piece in "[{") - (piece in "]}")
+        if piece in _CLOSES:
+            closing = _CLOSES[piece] + closing
+        elif piece in _CLOSES.values():
+            closing = closing[1:]
         line += piece.count("\n")
         if piece == "\n":
-            yield line, depth
+            yield line, closing
 
 
 def line_of(text: str, place: Place) -> int | None:
     """The line, from 1, on which the key or element at a place begins in a valid TOML text; ``None`` if it has none.
 
-    A prefix that ends with a statement is valid TOML. The first of these that contains the place ends with its
-    statement, which begins where the one before ends. An element of a list is searched within its statement.
+    What stands before the end of a line, its brackets closed, is valid TOML. The first of these texts that contains
+    the place has it behind the one before.
     """
     lines = text.split("\n")
-    ends = [0, *(line for line, depth in _line_ends(text) if not depth), len(lines)]
+    ends = [(0, ""), *_line_ends(text), (len(lines), "")]
 
-    def has_place(end: int) -> bool:
-        return value_at(tomllib.loads("\n".join(lines[:end])), place) is not None
+    def has_place(end: tuple[int, str]) -> bool:
+        return value_at(tomllib.loads("\n".join((*lines[: end[0]], end[1]))), place) is not None
 
-    if not has_place(len(lines)):
+    if not has_place(ends[-1]):
         return None
-    at = bisect_left(ends, True, key=has_place)
-    return _element_line(lines, ends[at - 1], ends[at], place)
-
-
-def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
-    """The line of a place in the statement between two lines: not its first only for an element of a list."""
-    if begin + 1 == end:
-        return end
-    text = "\n".join(lines[begin:end])
-    inline = value_at(tomllib.loads(text), place) is not None
-    indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
-    if not indices:
-        return begin + 1
-
-    def has_element(line: int) -> bool:
-        try:
-            value: object = tomllib.loads("\n".join(lines[begin : begin + line]) + "\n]")
-        except ValueError:
-            return False
-        while isinstance(value, dict) and value:
-            value = next(iter(value.values()))
-        return isinstance(value, list) and len(value) > indices[0]
-
-    stops = [line for line, depth in _line_ends(text) if depth == 1]
-    at = bisect_left(stops, True, key=has_element)
-    return begin + stops[at] if at < len(stops) else end
+    return ends[bisect_left(ends, True, key=has_place) - 1][0] + 1
 
 
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
