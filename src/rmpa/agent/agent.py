@@ -549,7 +549,7 @@ class Agent:
                 sock.close()
 
     def apply_settings(self, settings: Settings) -> None:
-        """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""
+        """Take settings that were read again; only live ones differ."""
         before, self.settings = self.settings, settings
         if not before.allows_direct:
             self._warn_of_stale_connections()

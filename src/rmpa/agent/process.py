@@ -14,7 +14,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from rmpa import __version__
 from rmpa.config.settings import SETTINGS
@@ -52,8 +52,6 @@ CHILD_END: Final = 5.0
 # Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``).
 
 
-# The fields of ``Settings`` that a running agent takes; all others need a restart.
-LIVE: Final = frozenset(setting.path[0] for setting in SETTINGS if setting.live)
 # The most characters of a value in a text for the user.
 _VALUE_SHOWN: Final = 60
 
@@ -64,7 +62,7 @@ class Reloader:
     Args:
         settings: Those that the agent runs with.
         load: Reads all sources again; may take long and raise ``ConfigError``.
-        apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
+        apply: Called with the settings that hold from now on; only live ones differ.
         check: Raises ``RmpaError`` where an agent that now runs with the first could not start with the second.
 
     Attributes:
@@ -86,7 +84,7 @@ class Reloader:
         self.waiting: tuple[str, ...] = ()
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
-        """Read the settings and apply those of ``LIVE``; if they have an error or would not start, nothing changes.
+        """Read the settings and apply the live ones; if they have an error or would not start, nothing changes.
 
         Args:
             check: Whether to report only what would change, and to apply nothing.
@@ -125,8 +123,10 @@ class Reloader:
         )
 
     def _take(self, settings: Settings, reply: ReloadReply) -> None:
-        tables = {name: _taken(name, getattr(self._settings, name), getattr(settings, name)) for name in LIVE}
-        self._settings = replace(self._settings, config_file=settings.config_file, **tables)
+        taken = replace(self._settings, config_file=settings.config_file)
+        for setting in (each for each in SETTINGS if each.live):
+            taken = setting.put(taken, setting.value_in(settings))
+        self._settings = taken
         self.waiting = reply.restart
         if reply.changed:
             self._apply(self._settings)
@@ -168,12 +168,6 @@ def has_terminal() -> bool:
     except OSError:
         return False
     return True
-
-
-def _taken(name: str, old: Any, new: Any) -> Any:
-    """A field of ``Settings`` as it holds from now on: of a table, what is not live stays as it was."""
-    kept = [setting.path[1] for setting in SETTINGS if setting.path[0] == name and not setting.live]
-    return replace(new, **{key: getattr(old, key) for key in kept}) if kept else new
 
 
 def _shown(value: object) -> str:

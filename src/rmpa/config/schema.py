@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from rmpa.config.values import BOOL, BadValue, JsonSchema, ValueType, read_at, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _T = TypeVar("_T")
 # A key of the file: ``("core", "port")``.
@@ -99,6 +99,17 @@ class Setting:
     def value_in(self, settings: object) -> object:
         """Its value in a ``Settings``."""
         return reduce(getattr, self.path, settings)
+
+    def put(self, settings: _T, value: object) -> _T:
+        """A ``Settings`` that has another value of it."""
+        return _with(settings, self.path, value)
+
+
+def _with(table: _T, path: Sequence[str], value: object) -> _T:
+    """A dataclass of settings with one other value, at a path of attributes."""
+    name, *rest = path
+    inner = _with(getattr(table, name), rest, value) if rest else value
+    return replace(table, **{name: inner})  # type: ignore[type-var] # each is a dataclass of settings
 
 
 def setting(
