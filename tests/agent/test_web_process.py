@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import os
 import signal
@@ -16,11 +15,11 @@ import pytest
 from rmpa.agent import process as limits
 from rmpa.agent.process import ChildProcess
 from rmpa.config.settings import Settings, WebSettings
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-DEADLINE = 30.0
 WAITS = "import signal; signal.pause()"
 PAUSES = "[signal.pause() for _ in iter(int, 1)]"
 
@@ -58,12 +57,6 @@ async def kill_agent(child: Child) -> int:
     child._keeper.cancel()
     assert child.pid is not None
     return child.pid
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(DEADLINE):
-        while not condition():
-            await asyncio.sleep(0.01)
 
 
 @pytest.fixture
