@@ -109,8 +109,6 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
-        if trust is not None:
-            trust.identity = self.identity
         self._members: set[Guid] = set()
         self.mesh = Mesh(
             self.identity,
@@ -245,8 +243,6 @@ class Network:
     async def _leave(self, *, moves: bool = False) -> None:
         if self.endpoint is not None:
             endpoint, self.endpoint = self.endpoint, None
-            if self.trust is not None:
-                self.trust.identity = None
             await endpoint.close(moves=moves)
 
     def move(self) -> None:
@@ -463,7 +459,7 @@ class Agent:
         self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
         answers = nodes, self.sites, rates
         self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, *answers)
-        self.trust_commands = TrustCommands(settings, self.trust)
+        self.trust_commands = TrustCommands(settings, self.network)
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
             "why": self.why.answer,

@@ -51,10 +51,10 @@ from rmpa.trust.permissions import (
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
+    from rmpa.agent.agent import Network
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
-    from rmpa.core.identity import Identity
     from rmpa.runtime.loop import SystemClock
     from rmpa.trust.joining import JoinServer
     from rmpa.trust.membership import Membership, MeshAuthority
@@ -118,7 +118,6 @@ class AgentTrust(Part):
         StartError: A file of the authority is broken.
 
     Attributes:
-        identity: This module's place in the network; ``None`` while it has none.
         authority: What the authority has; ``None``: this module is not it.
         joins: The joins at the authority.
     """
@@ -130,7 +129,6 @@ class AgentTrust(Part):
         from rmpa.trust.membership import MeshAuthority  # noqa: PLC0415 - as in ``open_membership``
 
         self.membership = membership
-        self.identity: Identity | None = None
         self._settings = settings
         self._bridge = bridge
         self._clock = clock
@@ -365,12 +363,13 @@ class TrustCommands:
 
     Args:
         settings: The agent's.
-        part: Its part in a secured mesh; ``None``: trust is off.
+        network: Its place in the network, with its part in a secured mesh.
     """
 
-    def __init__(self, settings: Settings, part: AgentTrust | None) -> None:
+    def __init__(self, settings: Settings, network: Network) -> None:
         self._settings = settings
-        self._part = part
+        self._network = network
+        self._part = network.trust
 
     async def answer_command(self, args: Args) -> object:
         """``what``: the name of one of the methods below; the other arguments are its own.
@@ -419,10 +418,10 @@ class TrustCommands:
 
     def _place(self, args: Args) -> tuple[str, int]:
         """Where a joining module reaches this one: as the user says, else as beacons say."""
-        identity, address, port = self._trust.identity, args.get("address"), args.get("port")
-        if identity is None:
+        at, address, port = self._network.endpoint, args.get("address"), args.get("port")
+        if at is None:
             raise UnreachableError("network", "this agent", "it has no address at this moment; try again")
-        return str(address or identity.guid.address), port if isinstance(port, int) else identity.guid.port
+        return str(address or at.identity.guid.address), port if isinstance(port, int) else at.port
 
     async def step(self, args: Args) -> JoinStep:
         """What came of a token: ``id``; ``after``: the last step that is known, the next one is awaited."""
