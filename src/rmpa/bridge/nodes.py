@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
@@ -373,14 +372,14 @@ class ProxyKills:
     before the proxies. It ends only the nodes of this module; nodes of other modules live on.
 
     Args:
-        rpc: Sends the requests.
+        bridge: The peers.
 
     Attributes:
         _all: By caller of ``kill -a``: until when its further calls are taken for a part of that.
     """
 
-    def __init__(self, rpc: PeerRpc) -> None:
-        self._rpc = rpc
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
         self._all: dict[str, float] = {}
         self._under_way = 0
 
@@ -393,15 +392,20 @@ class ProxyKills:
         _log.info("= %s asks the agent's own node to end (%s): it stays, end the agent instead", caller, reason)
         return RosReply(_REFUSED, "this node is the agent; it ends with `rmpa up`", 0)
 
-    async def proxy(self, session: PeerSession, node: str, caller: str, reason: str) -> RosReply:
+    async def proxy(self, proxy: str, caller: str, reason: str) -> RosReply:
         """End the node that a proxy stands for, because the proxy was asked to end.
 
         Args:
-            session: The peer that has the node.
-            node: The node's name in the peer's graph.
+            proxy: The proxy's name.
             caller: The caller's node.
             reason: The caller's reason, as text.
         """
+        linked = self._bridge.sessions.linked()
+        session = next((one for one in linked if proxy.startswith(f"{one.proxies.prefix}/")), None)
+        if session is None:
+            module, node = proxied_node(proxy) or ("", proxy)
+            return RosReply(_REFUSED, f"{node} is a node of {module}, to which there is no link: ask there", 0)
+        node = proxy.removeprefix(session.proxies.prefix)
         whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:
             # Another local node took the proxy's name. That does not concern the node at the peer.
@@ -420,14 +424,12 @@ class ProxyKills:
         if self._all.get(caller, 0.0) > now:
             self._all[caller] = now + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
-        if not session.linked:
-            return f"{session.link.name} is not linked"
         if self._under_way >= limits.NODE_KILLS_AT_ONCE:
             return f"{self._under_way} other nodes are being ended; try again"
         self._under_way += 1
         try:
             args = {"node": node, "by": caller, "reason": reason[: limits.ASK_NAME_MAX]}
-            answer = await self._rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
+            answer = await self._bridge.rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
         except RmpaError as error:
             return str(error)
         finally:
