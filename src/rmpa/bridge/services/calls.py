@@ -363,7 +363,6 @@ class Serving:
         self._exports = exports
         self._budgets = budgets
         self.stats: dict[str, CallStats] = {}
-        self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
         self._tasks = OwnedTasks()
         self._looking: asyncio.Task[None] | None = None
@@ -393,28 +392,20 @@ class Serving:
         pool, stats = self._pool(route.service, server), self.stats.setdefault(route.service, CallStats())
         budgets = self._budgets[peer]
         served = Server(session.link, number, pool, route.timeout, budgets, stats, session.time)
-        self._servers[peer, route.requests] = session.link.routes[route.requests] = served
+        session.link.routes[route.requests] = served
 
     def end_route(self, peer: int, requests: int) -> None:
         """End an open route: no more requests come, and replies of calls under way are dropped."""
-        server = self._servers.pop((peer, requests), None)
-        if server is not None:
-            server.close()
         session = self._sessions.get(peer)
-        if session is not None:
-            session.link.routes.pop(requests, None)
+        server = session.link.routes.pop(requests, None) if session is not None else None
+        if isinstance(server, Server):
+            server.close()
 
     def server_gone(self, service: str) -> None:
         """Close the connections to a server that left or was replaced."""
         pool = self._pools.pop(service, None)
         if pool is not None:
             pool.close("its server has gone")
-
-    def lane_lost(self, peer: int) -> None:
-        """Report the calls whose replies may be lost: the bulk lane's connection to a peer is gone."""
-        for (owner, _), server in list(self._servers.items()):
-            if owner == peer:
-                server.lane_lost()
 
     def close_idle(self, before: float) -> None:
         """Close the connections to servers that were not used since ``before`` (``loop.time()``).

@@ -20,7 +20,7 @@ from rmpa.bridge.peer import PeerState
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
-from rmpa.bridge.services.calls import Budgets, Serving, ShownService
+from rmpa.bridge.services.calls import Budgets, Server, Serving, ShownService
 from rmpa.bridge.services.direct import ServicePaths
 from rmpa.core.facts import DENIED
 from rmpa.core.identity import is_own
@@ -167,10 +167,9 @@ class Services(GraphPart):
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
-        for shown in list(self):
-            if shown.remote.peer == session.peer:
-                shown.lane_lost()
-        self.serving.lane_lost(session.peer)
+        for taker in list(session.link.routes.values()):
+            if isinstance(taker, ShownService | Server):
+                taker.lane_lost()
 
     def reconcile(self) -> None:
         """Register missing services again, and close routes and connections that are not used."""
