@@ -139,12 +139,14 @@ class Launcher(Part):
         except RmpaError:
             return
         for name, note in notes.items():
-            self._of(name, self._folder / note.made_of[0]).adopt(note)
+            if not (one := self._of(name, self._folder / note.made_of[0])).runs:
+                one.adopt(note)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
-        one = self._launched.setdefault(name, ResourceProgram(name, path, self._state, self._bridge))
-        one.path = path
-        return one
+        if name not in self._launched:
+            self._launched[name] = ResourceProgram(name, path, self._state, self._bridge)
+        self._launched[name].path = path
+        return self._launched[name]
 
     async def _boot(self) -> None:
         try:

@@ -180,9 +180,10 @@ class KeptProgram(ABC):
         await asyncio.shield(self._starting)
 
     async def _keep(self) -> None:
-        due = self.mark is None
+        due, said = self.mark is None, {0: "ended in order", _USAGE: self.unusable}
         while True:
-            began, code = time.monotonic(), None
+            began = time.monotonic()
+            code: int | None = None
             try:
                 if due:
                     await self._spawn()
@@ -190,7 +191,7 @@ class KeptProgram(ABC):
                     await ended(self.mark.pid)
                 due, code = True, self._child.poll() if self._child is not None else None
                 self.state = "stopped" if code == 0 else "failed"
-                self.why = {0: "ended in order", _USAGE: self.unusable}.get(code, how_ended(code))
+                self.why = how_ended(code) if code not in said else said[code]
             except OSError as error:
                 due = not self.runs
                 self.state, self.why = "failed", f"cannot be started: {error.strerror}"
