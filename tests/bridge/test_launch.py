@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import random
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -15,44 +14,31 @@ from typing import Any
 import pytest
 
 from rmpa.bridge import launched, limits
-from rmpa.bridge.context import BridgeContext
 from rmpa.bridge.launch import LAUNCH, Launcher
 from rmpa.bridge.launched import LaunchedResource, ModuleResources, is_name, list_files
-from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.config.peer_rules import PermissionRule
-from rmpa.config.settings import ResourceSettings, Settings, TrustSettings
+from rmpa.config.settings import ResourceSettings, Settings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.runtime.programs import StartRule, figures
-from rmpa.trust.permissions import Permissions
-from tests.bridge.asked_peers import AskedPeers
+from tests.bridge.asked_module import AskedModule
 from tests.waiting import until
 
 FAKE = Path(__file__).parent / "fake_resource.py"
 MAY = PermissionRule(("arm",), names={"launch": ("/cam",)})
 
 
-class Module:
+class Module(AskedModule):
     """A module's part, beside a bridge that is made up."""
 
     def __init__(self, home: Path, *rules: PermissionRule, default: str = "deny", **resources: Any) -> None:
-        gate = PermissionGate(Permissions(TrustSettings(default, rules=rules))) if rules else OPEN_GATE
         self.published: dict[str, dict[str, str]] = {}
-        self.answers: dict[str, Any] = {}
-        self.rpc = AskedPeers(lambda session, _what, _args: self.answers[session.link.name])
         given = ResourceSettings(**{"folder": str(home / "resources"), **resources})
         settings = Settings(name="base", state_dir=str(home / "state"), resources=given)
         core = SimpleNamespace(uri="http://127.0.0.1:1/", publishers=lambda topic: self.published.get(topic, {}))
-        self.sessions: list[Any] = []
-        bridge: Any = SimpleNamespace(
-            rpc=self.rpc,
-            core=core,
-            context=BridgeContext.of(settings, gate),
-            rng=random.random,
-            sessions=SimpleNamespace(linked=lambda: self.sessions),
-        )
+        super().__init__(settings, *rules, default=default, core=core)
         self.folder = home / "resources"
         self.folder.mkdir(exist_ok=True)
-        self.part = Launcher(bridge)
+        self.part = Launcher(self.bridge)
 
     def file(self, name: str, text: str = "") -> Path:
         path = self.folder / name
@@ -64,9 +50,7 @@ class Module:
         return found
 
     async def ask(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
-        session = SimpleNamespace(link=SimpleNamespace(name=asker))
-        handler: Any = self.rpc.handlers[LAUNCH]
-        found: ModuleResources = await handler(session, {"what": what, "name": name, **more})
+        found: ModuleResources = await self.answer(asker, LAUNCH, {"what": what, "name": name, **more})
         return found
 
     async def states(self) -> dict[str, str]:
@@ -315,14 +299,15 @@ async def test_thousands_of_requests_start_nothing_and_are_logged_once(
 async def test_all_modules_are_asked_and_each_problem_is_told(make: Callable[..., Module]) -> None:
     module = make()
     module.file("cam.resource.toml")
-    module.answers = {
+    answers = {
         "arm": {"module": "lies", "resources": [{"name": "hand", "file": "hand.py", "state": "active"}]},
         "old": PeerRefused("old", "this agent does not know the question 'launch'"),
         "hung": UnreachableError("agent", "hung"),
         "evil": {"resources": 7},
         "shut": PeerRefused("shut", "the permissions there do not let base start any resource"),
     }
-    module.sessions = [SimpleNamespace(link=SimpleNamespace(name=name, guid=f"of {name}")) for name in module.answers]
+    for name, answer in answers.items():
+        module.peer(name, answer)
     found = {one.module: one for one in await module.part.answer({"what": "list"})}
     assert list(found) == ["base", "arm", "old", "hung", "evil", "shut"]
     assert [one.name for one in found["arm"].resources] == ["hand"]

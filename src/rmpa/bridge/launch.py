@@ -139,7 +139,8 @@ class Launcher(Part):
         except RmpaError:
             return
         for name, note in notes.items():
-            if not (one := self._of(name, self._folder / note.made_of[0])).runs:
+            one = self._of(name, self._folder / note.made_of[0])
+            if not one.runs:
                 one.adopt(note)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
