@@ -209,8 +209,8 @@ class Side:
 
     async def look(self) -> None:
         self.params.reconcile()
-        while self.params._looking is not None:
-            await asyncio.sleep(0)
+        assert self.params._looking is not None
+        await asyncio.wait([self.params._looking])
 
     async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
         return await self.asks.request(self.links[number], what, args)
@@ -387,7 +387,7 @@ async def test_a_large_value_does_not_replace_one_that_was_told_after_it() -> No
     for deliver in lane.kept:
         deliver()
     await until(lambda: pad.core.get("/base/robot_description") == "small")
-    await until(lambda: base.params.owner._followers[1].task is None)
+    await until(lambda: all(task is None or task.done() for task in base.params.owner.tasks()))
     assert pad.core.get("/base/robot_description") == "small"
 
 
@@ -421,7 +421,7 @@ async def test_what_is_set_here_is_put_back(size: int, caplog: pytest.LogCapture
     base.core.set("/robot_description", "x" * size)
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "x" * size)
-    await until(lambda: not pad.params._working)
+    await until(lambda: pad.params._working is not None and pad.params._working.done())
     pad.core.set("/base", {"robot_description": "mine"})
     await pad.look()
     assert pad.core.get("/base/robot_description") == "x" * size

@@ -247,25 +247,22 @@ class Network:
 
     def move(self) -> None:
         """Take a new GUID, with an address that the machine has."""
-        if self._moving is None:
+        if self._moving is None or self._moving.done():
             self._moving = start_task(self._move(), "move to the new address")
 
     async def _move(self) -> None:
-        try:
-            port = self.endpoint.port if self.endpoint is not None else self.settings.port
-            _log.info("= the machine's addresses have changed: taking a new GUID")
-            joined = False
-            while not joined and not self._over.is_set():
-                try:
-                    await self._leave(moves=True)
-                    await self._join(port)
-                    joined = True
-                except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed
-                    _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
-        finally:
-            self._moving = None
+        port = self.endpoint.port if self.endpoint is not None else self.settings.port
+        _log.info("= the machine's addresses have changed: taking a new GUID")
+        joined = False
+        while not joined and not self._over.is_set():
+            try:
+                await self._leave(moves=True)
+                await self._join(port)
+                joined = True
+            except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed
+                _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
 
 
 def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:

@@ -488,22 +488,20 @@ class ParamOwner:
     def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
         for key in keys:
             follower.told.pop(key, None)
-        if follower.task is None and not follower.keys <= follower.told.keys():
+        idle = follower.task is None or follower.task.done()
+        if idle and not follower.keys <= follower.told.keys():
             name = f"tell {follower.session.link.name} of parameters"
             follower.task = start_task(self._tell(follower), name)
 
     async def _tell(self, follower: _Follower) -> None:
         """Tell a peer the present values of what has changed, one after the other; what fails is left to ``look``."""
-        try:
-            while not follower.keys <= follower.told.keys():
-                await asyncio.sleep(limits.PARAM_GATHER)
-                for key in follower.keys - follower.told.keys():
-                    follower.told[key] = 0  # before it is read: a change meanwhile takes the mark away
-                    if key in follower.keys and not await self._tell_one(follower, key):
-                        follower.told.pop(key, None)
-                        return
-        finally:
-            follower.task = None
+        while not follower.keys <= follower.told.keys():
+            await asyncio.sleep(limits.PARAM_GATHER)
+            for key in follower.keys - follower.told.keys():
+                follower.told[key] = 0  # before it is read: a change meanwhile takes the mark away
+                if key in follower.keys and not await self._tell_one(follower, key):
+                    follower.told.pop(key, None)
+                    return
 
     async def _tell_one(self, follower: _Follower, key: str) -> bool:
         """Tell a peer a parameter's present value, or why it may not follow it; return whether that has arrived."""
