@@ -180,7 +180,8 @@ class KeptProgram(ABC):
         await asyncio.shield(self._starting)
 
     async def _keep(self) -> None:
-        due, said = self.mark is None, {0: "ended in order", _USAGE: self.unusable}
+        due = self.mark is None
+        said: dict[int | None, str] = {0: "ended in order", _USAGE: self.unusable}
         while True:
             began = time.monotonic()
             code: int | None = None
@@ -191,7 +192,7 @@ class KeptProgram(ABC):
                     await ended(self.mark.pid)
                 due, code = True, self._child.poll() if self._child is not None else None
                 self.state = "stopped" if code == 0 else "failed"
-                self.why = how_ended(code) if code not in said else said[code]
+                self.why = said.get(code, how_ended(code))
             except OSError as error:
                 due = not self.runs
                 self.state, self.why = "failed", f"cannot be started: {error.strerror}"
