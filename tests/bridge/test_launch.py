@@ -49,7 +49,7 @@ class Module(AskedModule):
         (found,) = await self.part.answer({"what": what, "name": name, **more})
         return found
 
-    async def ask(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
+    async def asks(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
         found: ModuleResources = await self.answer(asker, LAUNCH, {"what": what, "name": name, **more})
         return found
 
@@ -199,16 +199,16 @@ async def test_a_peer_without_the_permission_starts_nothing_whatever_the_default
         module.file("cam.resource.toml")
         for what in ("start", "stop", "restart", "log"):
             with pytest.raises(RmpaError, match="do not let eve start /cam") as refused:
-                await module.ask(what, "cam", asker="eve")
+                await module.asks(what, "cam", asker="eve")
             assert refused.value.code == "not-permitted"
         with pytest.raises(RmpaError, match="do not let eve start any resource"):
-            await module.ask("list", asker="eve")
+            await module.asks("list", asker="eve")
         assert not module.part._launched
     module.file("other.resource.toml")
-    assert [one.name for one in (await module.ask("list")).resources] == ["cam"], "no other is named"
-    assert (await module.ask("start", "cam")).resources[0].state == "active"
+    assert [one.name for one in (await module.asks("list")).resources] == ["cam"], "no other is named"
+    assert (await module.asks("start", "cam")).resources[0].state == "active"
     with pytest.raises(RmpaError, match="do not let arm start /other"):
-        await module.ask("start", "other")
+        await module.asks("start", "other")
 
 
 async def test_in_an_open_mesh_nothing_is_started_unless_the_settings_allow_it(make: Callable[..., Module]) -> None:
@@ -216,9 +216,9 @@ async def test_in_an_open_mesh_nothing_is_started_unless_the_settings_allow_it(m
     module.file("cam.resource.toml")
     for what in ("list", "start", "log"):
         with pytest.raises(RmpaError, match="the mesh is not secured, and open of"):
-            await module.ask(what, "cam")
+            await module.asks(what, "cam")
     assert not module.part._launched
-    assert (await make(open=True).ask("start", "cam")).resources[0].state == "active"
+    assert (await make(open=True).asks("start", "cam")).resources[0].state == "active"
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ async def test_only_a_plain_name_is_taken(make: Callable[..., Module], name: Any
     module.file("cam.resource.toml")
     assert not is_name(name)
     with pytest.raises(RmpaError, match="names no resource"):
-        await module.ask("start", name)
+        await module.asks("start", name)
     assert "has no file of a resource" in (await module.do("start", name)).problem
     assert not module.part._launched
 
@@ -265,13 +265,13 @@ async def test_a_file_that_others_may_write_or_that_leads_elsewhere_is_refused(
     for name, why in expected.items():
         assert why in told[name].why
         if is_name(name):
-            answer = await module.ask("start", name)
+            answer = await module.asks("start", name)
             assert (answer.code, why in answer.problem) == ("launch-refused", True)
     assert told["fine"].state == "stopped"
     module.file("helper.py").chmod(0o666)  # fine.py could import it
-    assert "helper.py" in (await module.ask("start", "fine")).problem
+    assert "helper.py" in (await module.asks("start", "fine")).problem
     module.folder.chmod(0o777)
-    assert "every user may write" in (await module.ask("start", "fine")).problem
+    assert "every user may write" in (await module.asks("start", "fine")).problem
     module.folder.chmod(0o755)
     assert not any(one.runs for one in module.part._launched.values())
 
@@ -291,7 +291,7 @@ async def test_thousands_of_requests_start_nothing_and_are_logged_once(
     module.file("cam.resource.toml")
     for number in range(3_000):
         with pytest.raises(RmpaError):
-            await module.ask("start", f"n{number}", asker="eve")
+            await module.asks("start", f"n{number}", asker="eve")
     assert not module.part._launched
     assert len([each for each in caplog.records if "eve" in each.getMessage()]) == 1
 

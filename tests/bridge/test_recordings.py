@@ -36,7 +36,7 @@ class World(AskedModule):
         self.base = self.peer("base")
         self.part = Recordings(self.bridge)
 
-    async def ask(self, what: str, **args: Any) -> Any:
+    async def asks(self, what: str, **args: Any) -> Any:
         """What the peer is answered."""
         handler: Any = self.handlers[what]
         return await handler(self.base, args)
@@ -97,7 +97,7 @@ async def test_a_peers_times_are_put_on_this_clock(tmp_path: Path) -> None:
     world = World(tmp_path)
     world.base.time = SimpleNamespace(ahead_ns=5 * 10**9)
     kept = Kept(id="fall", why="it fell", since=NOW, until=NOW + 10**9)
-    assert await world.ask(KEEP, kept=msgspec.to_builtins(kept)) == ""
+    assert await world.asks(KEEP, kept=msgspec.to_builtins(kept)) == ""
     (found,) = await world.requests()
     assert (found.since, found.until, found.asked_by) == (NOW - 5 * 10**9, NOW - 4 * 10**9, "base")
 
@@ -117,7 +117,7 @@ async def test_how_long_ago_counts_when_clocks_were_set(tmp_path: Path, monkeypa
     assert sent["now"] - now < 60 * 10**9, "by the clock as it was"
     await world.requests()
     world.base.time = SimpleNamespace(ahead_ns=-hour)  # as the peer still knew it
-    assert await world.ask(KEEP, **sent) == ""
+    assert await world.asks(KEEP, **sent) == ""
     (found,) = await world.requests()
     assert abs(found.until - (now + hour)) < 60 * 10**9
     assert found.until - found.since == 60 * 10**9
@@ -144,18 +144,18 @@ async def test_a_file_is_read_in_parts_and_nothing_beside_it(tmp_path: Path) -> 
     await asyncio.to_thread((world.folder / "secret").write_text, "x")
     found = b""
     while len(found) < len(data):
-        part = await world.ask(READ, id="fall", file="1.mcap", offset=len(found))
+        part = await world.asks(READ, id="fall", file="1.mcap", offset=len(found))
         assert part.size == len(data)
         found += base64.b64decode(part.data)
     assert found == data
-    part = await world.ask(READ, id="fall", file="1.mcap", offset=1000, size=20, check=True)
+    part = await world.asks(READ, id="fall", file="1.mcap", offset=1000, size=20, check=True)
     assert (base64.b64decode(part.data), part.before) == (data[1000:1020], zlib.crc32(data[:1000]))
-    assert (await world.ask(READ, id="fall", file="1.mcap", offset=10**7, check=True)).before == zlib.crc32(data)
+    assert (await world.asks(READ, id="fall", file="1.mcap", offset=10**7, check=True)).before == zlib.crc32(data)
     for name, file in (("fall", "../../secret"), ("fall", "recording.json"), ("..", "secret"), ("none", "1.mcap")):
         with pytest.raises(RmpaError, match=r"no file|no recording|not the name"):
-            await world.ask(READ, id=name, file=file, offset=0)
+            await world.asks(READ, id=name, file=file, offset=0)
     with pytest.raises(RmpaError, match="no file"):
-        await world.ask(READ, id="fall", file="1.mcap", offset=-1)
+        await world.asks(READ, id="fall", file="1.mcap", offset=-1)
 
 
 async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp
     )
     for what, args in requests:
         with pytest.raises(RmpaError, match="let base use the recording"):
-            await world.ask(what, **args)
+            await world.asks(what, **args)
     assert not await world.requests()
     assert [one.id for one in (await world.part.list())[0].kept] == ["fall"]
 
@@ -180,10 +180,10 @@ async def test_a_rule_lets_a_module_have_some(tmp_path: Path) -> None:
     world = World(tmp_path, rule, secured=True)
     await world.record("fall")
     await world.record("private")
-    assert [one.id for one in (await world.ask(LIST)).kept] == ["fall"]
-    assert (await world.ask(REMOVE, id="fall")).id == "fall"
+    assert [one.id for one in (await world.asks(LIST)).kept] == ["fall"]
+    assert (await world.asks(REMOVE, id="fall")).id == "fall"
     with pytest.raises(RmpaError, match="let base use the recording"):
-        await world.ask(REMOVE, id="private")
+        await world.asks(REMOVE, id="private")
 
 
 async def test_an_earlier_release_is_named(tmp_path: Path) -> None:

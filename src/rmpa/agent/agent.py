@@ -456,7 +456,9 @@ class Agent:
         self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
         answers = nodes, self.sites, rates
         self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, *answers)
-        self.trust_commands = TrustCommands(settings, self.network)
+        self.trust_commands = TrustCommands(
+            settings, self.trust, lambda: at.identity if (at := self.network.endpoint) else None
+        )
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
             "why": self.why.answer,

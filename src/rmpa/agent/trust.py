@@ -51,10 +51,12 @@ from rmpa.trust.permissions import (
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
-    from rmpa.agent.agent import Network
+    from collections.abc import Callable
+
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
+    from rmpa.core.identity import Identity
     from rmpa.runtime.loop import SystemClock
     from rmpa.trust.joining import JoinServer
     from rmpa.trust.membership import Membership, MeshAuthority
@@ -363,13 +365,14 @@ class TrustCommands:
 
     Args:
         settings: The agent's.
-        network: Its place in the network, with its part in a secured mesh.
+        part: Its part in a secured mesh; ``None``: trust is off.
+        place: This module's place in the network; ``None`` while it has none.
     """
 
-    def __init__(self, settings: Settings, network: Network) -> None:
+    def __init__(self, settings: Settings, part: AgentTrust | None, place: Callable[[], Identity | None]) -> None:
         self._settings = settings
-        self._network = network
-        self._part = network.trust
+        self._part = part
+        self._own_place = place
 
     async def answer_command(self, args: Args) -> object:
         """``what``: the name of one of the methods below; the other arguments are its own.
@@ -418,10 +421,10 @@ class TrustCommands:
 
     def _place(self, args: Args) -> tuple[str, int]:
         """Where a joining module reaches this one: as the user says, else as beacons say."""
-        at, address, port = self._network.endpoint, args.get("address"), args.get("port")
-        if at is None:
+        identity, address, port = self._own_place(), args.get("address"), args.get("port")
+        if identity is None:
             raise UnreachableError("network", "this agent", "it has no address at this moment; try again")
-        return str(address or at.identity.guid.address), port if isinstance(port, int) else at.port
+        return str(address or identity.guid.address), port if isinstance(port, int) else identity.guid.port
 
     async def step(self, args: Args) -> JoinStep:
         """What came of a token: ``id``; ``after``: the last step that is known, the next one is awaited."""

@@ -193,7 +193,7 @@ class Recordings(Part):
         name = self._bridge.context.settings.name
         if folder is None or not folder.is_dir():
             return ModuleRecordings(module=name)
-        status: dict[str, Any] = msgspec.field(default_factory=dict)
+        status: dict[str, Any] = {}
         with contextlib.suppress(OSError, msgspec.DecodeError):  # no recorder has run
             status = msgspec.json.decode((folder / "status.json").read_bytes(), type=dict[str, Any])
         problem = ""

@@ -149,7 +149,7 @@ class KeptProgram(ABC):
             left = await asyncio.to_thread(self.left)
             await asyncio.gather(*(end_program(mark, self._end) for mark in left))
             with contextlib.suppress(OSError):
-                self._note.unlink()
+                await asyncio.to_thread(self._note.unlink)
             self.state = "stopped"
 
     def left(self) -> list[ProgramMark]:
