@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import random
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -16,63 +15,42 @@ import pytest
 
 from rmpa.bridge import launched, limits
 from rmpa.bridge.launch import LAUNCH, Launcher
-from rmpa.bridge.launch_files import is_name, list_files
-from rmpa.bridge.launched import LaunchedResource, ModuleResources
-from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
+from rmpa.bridge.launched import LaunchedResource, ModuleResources, is_name, list_files
 from rmpa.config.peer_rules import PermissionRule
-from rmpa.config.settings import ResourceSettings, Settings, TrustSettings
+from rmpa.config.settings import ResourceSettings, Settings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.runtime.programs import StartRule, figures
-from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_module import AskedModule
 from tests.waiting import until
 
 FAKE = Path(__file__).parent / "fake_resource.py"
 MAY = PermissionRule(("arm",), names={"launch": ("/cam",)})
 
 
-class Module:
+class Module(AskedModule):
     """A module's part, beside a bridge that is made up."""
 
     def __init__(self, home: Path, *rules: PermissionRule, default: str = "deny", **resources: Any) -> None:
-        gate = PermissionGate(Permissions(TrustSettings(default, rules=rules))) if rules else OPEN_GATE
-        self.handlers: dict[str, Any] = {}
         self.published: dict[str, dict[str, str]] = {}
-        self.answers: dict[str, Any] = {}
-        rpc = SimpleNamespace(on_request=lambda what, handler, _: self.handlers.update({what: handler}))
-        rpc.request = self._request
         given = ResourceSettings(**{"folder": str(home / "resources"), **resources})
         settings = Settings(name="base", state_dir=str(home / "state"), resources=given)
         core = SimpleNamespace(uri="http://127.0.0.1:1/", publishers=lambda topic: self.published.get(topic, {}))
-        self.sessions: list[Any] = []
-        bridge: Any = SimpleNamespace(
-            rpc=rpc,
-            core=core,
-            context=BridgeContext.of(settings, gate),
-            rng=random.random,
-            sessions=SimpleNamespace(linked=lambda: self.sessions),
-        )
+        super().__init__(settings, *rules, default=default, core=core)
         self.folder = home / "resources"
         self.folder.mkdir(exist_ok=True)
-        self.part = Launcher(bridge)
+        self.part = Launcher(self.bridge)
 
     def file(self, name: str, text: str = "") -> Path:
         path = self.folder / name
         path.write_text(text)
         return path
 
-    async def _request(self, session: Any, _what: str, args: dict[str, Any], _timeout: float) -> Any:
-        answer = self.answers[session.link.name]
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
     async def do(self, what: str, name: str | None = None, **more: Any) -> ModuleResources:
         (found,) = await self.part.answer({"what": what, "name": name, **more})
         return found
 
-    async def ask(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
-        session = SimpleNamespace(link=SimpleNamespace(name=asker))
-        found: ModuleResources = await self.handlers[LAUNCH](session, {"what": what, "name": name, **more})
+    async def asks(self, what: object, name: object = None, *, asker: str = "arm", **more: Any) -> ModuleResources:
+        found: ModuleResources = await self.answer(asker, LAUNCH, {"what": what, "name": name, **more})
         return found
 
     async def states(self) -> dict[str, str]:
@@ -221,16 +199,16 @@ async def test_a_peer_without_the_permission_starts_nothing_whatever_the_default
         module.file("cam.resource.toml")
         for what in ("start", "stop", "restart", "log"):
             with pytest.raises(RmpaError, match="do not let eve start /cam") as refused:
-                await module.ask(what, "cam", asker="eve")
+                await module.asks(what, "cam", asker="eve")
             assert refused.value.code == "not-permitted"
         with pytest.raises(RmpaError, match="do not let eve start any resource"):
-            await module.ask("list", asker="eve")
+            await module.asks("list", asker="eve")
         assert not module.part._launched
     module.file("other.resource.toml")
-    assert [one.name for one in (await module.ask("list")).resources] == ["cam"], "no other is named"
-    assert (await module.ask("start", "cam")).resources[0].state == "active"
+    assert [one.name for one in (await module.asks("list")).resources] == ["cam"], "no other is named"
+    assert (await module.asks("start", "cam")).resources[0].state == "active"
     with pytest.raises(RmpaError, match="do not let arm start /other"):
-        await module.ask("start", "other")
+        await module.asks("start", "other")
 
 
 async def test_in_an_open_mesh_nothing_is_started_unless_the_settings_allow_it(make: Callable[..., Module]) -> None:
@@ -238,9 +216,9 @@ async def test_in_an_open_mesh_nothing_is_started_unless_the_settings_allow_it(m
     module.file("cam.resource.toml")
     for what in ("list", "start", "log"):
         with pytest.raises(RmpaError, match="the mesh is not secured, and open of"):
-            await module.ask(what, "cam")
+            await module.asks(what, "cam")
     assert not module.part._launched
-    assert (await make(open=True).ask("start", "cam")).resources[0].state == "active"
+    assert (await make(open=True).asks("start", "cam")).resources[0].state == "active"
 
 
 @pytest.mark.parametrize(
@@ -255,7 +233,7 @@ async def test_only_a_plain_name_is_taken(make: Callable[..., Module], name: Any
     module.file("cam.resource.toml")
     assert not is_name(name)
     with pytest.raises(RmpaError, match="names no resource"):
-        await module.ask("start", name)
+        await module.asks("start", name)
     assert "has no file of a resource" in (await module.do("start", name)).problem
     assert not module.part._launched
 
@@ -287,13 +265,13 @@ async def test_a_file_that_others_may_write_or_that_leads_elsewhere_is_refused(
     for name, why in expected.items():
         assert why in told[name].why
         if is_name(name):
-            answer = await module.ask("start", name)
+            answer = await module.asks("start", name)
             assert (answer.code, why in answer.problem) == ("launch-refused", True)
     assert told["fine"].state == "stopped"
     module.file("helper.py").chmod(0o666)  # fine.py could import it
-    assert "helper.py" in (await module.ask("start", "fine")).problem
+    assert "helper.py" in (await module.asks("start", "fine")).problem
     module.folder.chmod(0o777)
-    assert "every user may write" in (await module.ask("start", "fine")).problem
+    assert "every user may write" in (await module.asks("start", "fine")).problem
     module.folder.chmod(0o755)
     assert not any(one.runs for one in module.part._launched.values())
 
@@ -313,7 +291,7 @@ async def test_thousands_of_requests_start_nothing_and_are_logged_once(
     module.file("cam.resource.toml")
     for number in range(3_000):
         with pytest.raises(RmpaError):
-            await module.ask("start", f"n{number}", asker="eve")
+            await module.asks("start", f"n{number}", asker="eve")
     assert not module.part._launched
     assert len([each for each in caplog.records if "eve" in each.getMessage()]) == 1
 
@@ -321,14 +299,15 @@ async def test_thousands_of_requests_start_nothing_and_are_logged_once(
 async def test_all_modules_are_asked_and_each_problem_is_told(make: Callable[..., Module]) -> None:
     module = make()
     module.file("cam.resource.toml")
-    module.answers = {
+    answers = {
         "arm": {"module": "lies", "resources": [{"name": "hand", "file": "hand.py", "state": "active"}]},
         "old": PeerRefused("old", "this agent does not know the question 'launch'"),
         "hung": UnreachableError("agent", "hung"),
         "evil": {"resources": 7},
         "shut": PeerRefused("shut", "the permissions there do not let base start any resource"),
     }
-    module.sessions = [SimpleNamespace(link=SimpleNamespace(name=name, guid=f"of {name}")) for name in module.answers]
+    for name, answer in answers.items():
+        module.peer(name, answer)
     found = {one.module: one for one in await module.part.answer({"what": "list"})}
     assert list(found) == ["base", "arm", "old", "hung", "evil", "shut"]
     assert [one.name for one in found["arm"].resources] == ["hand"]

@@ -12,15 +12,13 @@ import msgspec
 import pytest
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.log import LEVEL, LINES, ModuleLogs
-from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing
-from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
+from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.config.peer_rules import PermissionRule
-from rmpa.config.settings import Settings, TrustSettings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.identity import OWN_NODE
-from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_module import AskedModule
 
 NOW = 1_800_000_000 * 10**9
 
@@ -44,11 +42,11 @@ def ring_of(*lines: tuple[str, str, int]) -> LogRing:
     return ring
 
 
-def texts(found: LogLines) -> list[str]:
+def texts(found: ModuleLog) -> list[str]:
     return [line.text for line in found.lines]
 
 
-def ask(ring: LogRing, now_ns: int = NOW, **query: Any) -> LogLines:
+def ask(ring: LogRing, now_ns: int = NOW, **query: Any) -> ModuleLog:
     return ring.find(LogQuery.of(query), now_ns)
 
 
@@ -143,33 +141,18 @@ class Core:
         return SimpleNamespace(nodes={"/talker": "http://a:1/", "/secret": "http://a:2/", OWN_NODE: "http://a:3/"})
 
 
-class Module:
+class Module(AskedModule):
     """A module's part, beside a bridge that is made up."""
 
     def __init__(self, name: str, *rules: PermissionRule) -> None:
-        gate = PermissionGate(Permissions(TrustSettings(rules=rules))) if rules else OPEN_GATE
-        self.core, self.handlers = Core(), dict[str, Any]()
-        self.peers: list[Any] = []
-        rpc = SimpleNamespace(on_request=lambda what, handler, _: self.handlers.update({what: handler}))
-        rpc.request = self._request
-        context = BridgeContext.of(Settings(name=name), gate)
-        bridge: Any = SimpleNamespace(core=self.core, rpc=rpc, context=context, sessions=self.peers)
-        self.logs = ModuleLogs(bridge)
-        self.answers: dict[str, Any] = {}
+        self.core = Core()
+        super().__init__(Settings(name=name), *rules, core=self.core)
+        self.logs = ModuleLogs(self.bridge)
         self.logs.start()
 
-    def peer(self, name: str, answer: Any, *, ahead: float = 0.0, linked: bool = True) -> None:
-        time = LinkTime()
-        time.set(ahead, 0.002)
-        self.answers[name] = answer
-        link = SimpleNamespace(name=name, guid=f"guid of {name}")
-        self.peers.append(SimpleNamespace(link=link, time=time, linked=linked))
-
-    async def _request(self, session: Any, _what: str, args: dict[str, Any], _timeout: float) -> Any:
-        answer = self.answers[session.link.name]
-        if isinstance(answer, Exception):
-            raise answer
-        return answer(args) if callable(answer) else answer
+    async def lines(self, asker: str = "arm", **query: Any) -> ModuleLog:
+        found: ModuleLog = await self.answer(asker, LINES, query)
+        return found
 
 
 SAID = ["said by the talker", "said by another"]
@@ -184,23 +167,18 @@ def say() -> Any:
     return heard
 
 
-def asker(name: str = "arm") -> Any:
-    return SimpleNamespace(link=SimpleNamespace(name=name))
-
-
 async def test_a_peer_reads_and_sets_the_log_of_the_nodes_that_a_permission_names(say: Any) -> None:
     module = Module("base", PermissionRule(("arm",), names={"log": ("/talker",)}))
     say(module)
-    lines, level = module.handlers[LINES], module.handlers[LEVEL]
-    assert texts(lines(asker(), {})) == SAID[:1]
+    assert texts(await module.lines()) == SAID[:1]
     with pytest.raises(RmpaError, match="do not let eve use the log of"):
-        lines(asker("eve"), {})
+        await module.lines("eve")
     with pytest.raises(RmpaError, match="do not let arm use the log of /secret"):
-        await level(asker(), {"node": "/secret", "level": "debug"})
+        await module.answer("arm", LEVEL, {"node": "/secret", "level": "debug"})
     with pytest.raises(RmpaError, match="base has no node /no"):
-        await module.logs.level({"node": "/no"})
+        await module.logs.level(None, {"node": "/no"})
     with pytest.raises(RmpaError, match="/talker has no loggers"):  # it is permitted
-        await level(asker(), {"node": "/talker"})
+        await module.answer("arm", LEVEL, {"node": "/talker"})
     await module.logs.close()
 
 
@@ -211,12 +189,12 @@ async def test_lines_that_came_from_another_module_are_not_kept_again_and_the_ag
     logging.getLogger("rmpa.test").error("! the agent's own [failed]")
     await asyncio.to_thread(logging.getLogger("rmpa.test").error, "! of a thread [failed]")
     await asyncio.sleep(0)
-    found = module.handlers[LINES](asker(), {"level": "info"})
+    found = await module.lines(level="info")
     assert texts(found) == [*SAID, "! the agent's own [failed]", "! of a thread [failed]"]
     assert [line.agent for line in found.lines] == [False, False, True, True]
     await module.logs.close()
     logging.getLogger("rmpa.test").error("! after its end [failed]")
-    assert len(module.handlers[LINES](asker(), {}).lines) == 4
+    assert len((await module.lines()).lines) == 4
 
 
 async def test_the_logs_of_all_modules_have_one_clock_and_each_problem_is_told(say: Any) -> None:

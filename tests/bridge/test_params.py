@@ -14,10 +14,18 @@ from rmpa.bridge import limits
 from rmpa.bridge.bridge import Bridge
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import decode
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import owner as requests
 from rmpa.bridge.params.follower import Params
-from rmpa.bridge.params.owner import read_text, write_text
-from rmpa.bridge.params.transfer import follow_rules, key_problem, replaced, why_not_follow, why_not_get, why_not_set
+from rmpa.bridge.params.owner import (
+    follow_rules,
+    key_problem,
+    read_text,
+    replaced,
+    why_not_follow,
+    why_not_get,
+    why_not_set,
+    write_text,
+)
 from rmpa.bridge.policy import OPEN_GATE, BridgeContext, Needs, PermissionGate
 from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import PeerSession
@@ -200,8 +208,8 @@ class Side:
 
     async def look(self) -> None:
         self.params.reconcile()
-        while self.params._looking is not None:
-            await asyncio.sleep(0)
+        assert self.params._looking is not None
+        await asyncio.wait([self.params._looking])
 
     async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
         return await self.asks.request(self.links[number], what, args)
@@ -270,10 +278,10 @@ async def test_a_value_of_more_parameters_than_a_peer_may_set_sets_none(monkeypa
         text = await write_text("", {"deep": {f"p{number}": number for number in range(count)}})
         if count > 100:
             with pytest.raises(PeerRefused, match="/many has more than 100 parameters: set its parts one by one"):
-                await pad.ask(transfer.SET, {"key": "/many", "text": text})
+                await pad.ask(requests.SET, {"key": "/many", "text": text})
             assert base.core.get("/many") is None
         else:
-            assert await pad.ask(transfer.SET, {"key": "/many", "text": text}) == {"count": 100}
+            assert await pad.ask(requests.SET, {"key": "/many", "text": text}) == {"count": 100}
 
 
 async def test_get_set_list_delete() -> None:
@@ -282,33 +290,33 @@ async def test_get_set_list_delete() -> None:
     join(base, pad)
     base.core.set("/open", {"a": 1, "b": "x" * 5000})
     base.core.set("/closed", 1)
-    answer = await pad.ask(transfer.GET, {"key": "/open"})
+    answer = await pad.ask(requests.GET, {"key": "/open"})
     assert await read_text(answer["text"]) == {"a": 1, "b": "x" * 5000}
-    assert await read_text((await pad.ask(transfer.NAMES, {}))["text"]) == ["/open/a", "/open/b"]
+    assert await read_text((await pad.ask(requests.NAMES, {}))["text"]) == ["/open/a", "/open/b"]
     large = await write_text("", {"c": "y" * 9000, "d": {"e": True}})
-    assert await pad.ask(transfer.SET, {"key": "/open", "text": large}) == {"count": 2}
+    assert await pad.ask(requests.SET, {"key": "/open", "text": large}) == {"count": 2}
     assert base.core.get("/open") == {"a": 1, "b": "x" * 5000, "c": "y" * 9000, "d": {"e": True}}
-    await pad.ask(transfer.DELETE, {"key": "/open/d"})
+    await pad.ask(requests.DELETE, {"key": "/open/d"})
     assert base.core.get("/open/d") is None
     before = base.core.get("/")
     bad = await write_text("", {"open": {"new": 1}, "closed": 2})
     nil = (await write_text("", "x")).replace("<string>x</string>", "<nil/>")
     for what, args, error in (
-        (transfer.GET, {"key": "/closed"}, "no glob of params.remote_get"),
-        (transfer.GET, {"key": "/"}, "may not be read"),
-        (transfer.GET, {"key": "/open/nothing"}, "no parameter /open/nothing"),
-        (transfer.GET, {"key": "relative"}, "not the global name"),
-        (transfer.GET, {}, "not the global name"),
-        (transfer.SET, {"key": "/", "text": bad}, "/closed may not be set"),
-        (transfer.SET, {"key": "/open/x", "text": "<nonsense"}, "malformed XML"),
-        (transfer.SET, {"key": "/open/x", "text": nil}, "nil"),
-        (transfer.SET, {"key": "/open//x", "text": nil}, "not a parameter's name"),
-        (transfer.SET, {"key": "/run_id", "text": "x"}, "malformed XML"),
-        (transfer.SET, {"key": "/open/x", "text": "x" * 2000}, "malformed XML"),
-        (transfer.SET, {"key": "/open/x"}, "text of a parameter's value is missing"),
-        (transfer.DELETE, {"key": "/open/nothing"}, "no parameter /open/nothing"),
-        (transfer.DELETE, {"key": "/"}, "the root holds every parameter"),
-        (transfer.FOLLOW, {"keys": "x"}, "not a list"),
+        (requests.GET, {"key": "/closed"}, "no glob of params.remote_get"),
+        (requests.GET, {"key": "/"}, "may not be read"),
+        (requests.GET, {"key": "/open/nothing"}, "no parameter /open/nothing"),
+        (requests.GET, {"key": "relative"}, "not the global name"),
+        (requests.GET, {}, "not the global name"),
+        (requests.SET, {"key": "/", "text": bad}, "/closed may not be set"),
+        (requests.SET, {"key": "/open/x", "text": "<nonsense"}, "malformed XML"),
+        (requests.SET, {"key": "/open/x", "text": nil}, "nil"),
+        (requests.SET, {"key": "/open//x", "text": nil}, "not a parameter's name"),
+        (requests.SET, {"key": "/run_id", "text": "x"}, "malformed XML"),
+        (requests.SET, {"key": "/open/x", "text": "x" * 2000}, "malformed XML"),
+        (requests.SET, {"key": "/open/x"}, "text of a parameter's value is missing"),
+        (requests.DELETE, {"key": "/open/nothing"}, "no parameter /open/nothing"),
+        (requests.DELETE, {"key": "/"}, "the root holds every parameter"),
+        (requests.FOLLOW, {"keys": "x"}, "not a list"),
     ):
         with pytest.raises(PeerRefused, match=error):
             await pad.ask(what, args)
@@ -329,11 +337,11 @@ async def test_a_large_value_that_comes_after_its_asker_gave_it_up_is_not_set() 
     base, pad, args = await owner_and_peer()
     base.links[1].time.set(60.0, 0.001)  # by the peer's clock it is a minute later
     with pytest.raises(PeerRefused, match=r"came \d\d.\d s after the asking agent had given it up"):
-        await pad.ask(transfer.SET, args)
+        await pad.ask(requests.SET, args)
     assert base.core.get("/x") is None
     assert base.counters["ask.late"] == 1
     base.links[1].time.set(60.0, 61.0)  # perhaps not
-    assert await pad.ask(transfer.SET, args) == {"count": 1}
+    assert await pad.ask(requests.SET, args) == {"count": 1}
 
 
 async def test_large_messages_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -350,16 +358,16 @@ async def test_large_messages_are_bounded(monkeypatch: pytest.MonkeyPatch) -> No
     held = asyncio.create_task(pad.ask("hold", args))
     await entered.wait()
     with pytest.raises(PeerRefused, match="too many large questions at once"):
-        await pad.ask(transfer.SET, args)
+        await pad.ask(requests.SET, args)
     with pytest.raises(PeerRefused, match="the question was lost: large calls hold"):
-        await pad.ask(transfer.SET, args | {"text": args["text"] * 10})
+        await pad.ask(requests.SET, args | {"text": args["text"] * 10})
     monkeypatch.setattr(limits, "ASK_BYTES_MAX", 30_000)
     with pytest.raises(LimitExceeded, match="message between agents"):
-        await pad.ask(transfer.SET, args | {"text": args["text"] * 2})
+        await pad.ask(requests.SET, args | {"text": args["text"] * 2})
     leave.set()
     with pytest.raises(PeerRefused, match="the answer cannot be sent: message between agents"):
         await held
-    assert await pad.ask(transfer.SET, args) == {"count": 1}, "what was answered counts no more"
+    assert await pad.ask(requests.SET, args) == {"count": 1}, "what was answered counts no more"
     assert base.asks._links[1]._budget.used == pad.asks._links[1]._outgoing.used == 0
 
 
@@ -378,7 +386,7 @@ async def test_a_large_value_does_not_replace_one_that_was_told_after_it() -> No
     for deliver in lane.kept:
         deliver()
     await until(lambda: pad.core.get("/base/robot_description") == "small")
-    await until(lambda: base.params.owner._followers[1].task is None)
+    await until(lambda: all(task is None or task.done() for task in base.params.owner.tasks()))
     assert pad.core.get("/base/robot_description") == "small"
 
 
@@ -412,7 +420,7 @@ async def test_what_is_set_here_is_put_back(size: int, caplog: pytest.LogCapture
     base.core.set("/robot_description", "x" * size)
     join(base, pad)
     await until(lambda: pad.core.get("/base/robot_description") == "x" * size)
-    await until(lambda: not pad.params._working)
+    await until(lambda: pad.params._working is not None and pad.params._working.done())
     pad.core.set("/base", {"robot_description": "mine"})
     await pad.look()
     assert pad.core.get("/base/robot_description") == "x" * size
@@ -474,7 +482,7 @@ async def test_no_chains_and_no_loops() -> None:
     await until(lambda: "refused" in {**base.states(), **pad.states()}.values())
     text = await write_text("", 5)
     with pytest.raises(PeerRefused, match="followed from base:/arm"):
-        await base.ask(transfer.SET, {"key": "/arm/x", "text": text})
+        await base.ask(requests.SET, {"key": "/arm/x", "text": text})
 
 
 async def test_a_core_that_is_started_anew_gets_all_of_it_again() -> None:
@@ -573,7 +581,7 @@ async def test_values_that_do_not_parse_change_nothing(caplog: pytest.LogCapture
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
-    await base.ask(transfer.VALUE, {"key": "/arm", "text": "<x>"})
+    await base.ask(requests.VALUE, {"key": "/arm", "text": "<x>"})
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
     assert "/arm cannot be set as its owner has it" in caplog.text
@@ -611,9 +619,9 @@ async def test_a_slash_at_the_end_does_not_pass_a_deny(denied: str, key: str, va
     owner, peer = linked(ALL, denying(denied))
     owner.core.set("/motors/limit", 1)
     with pytest.raises(PeerRefused, match="do not let pad read or set"):
-        await peer.ask(transfer.SET, {"key": key, "text": await write_text("", value)})
+        await peer.ask(requests.SET, {"key": key, "text": await write_text("", value)})
     assert owner.core.get("/motors/limit") == 1
-    await peer.ask(transfer.SET, {"key": "/speed", "text": await write_text("", {"max": 2})})
+    await peer.ask(requests.SET, {"key": "/speed", "text": await write_text("", {"max": 2})})
     assert owner.core.get("/speed/max") == 2
 
 
@@ -637,21 +645,21 @@ async def test_parameters_are_read_and_set_only_with_permission() -> None:
     def no(key: str) -> str:
         return f"the permissions there do not let pad read or set {key}"
 
-    names = await asks(transfer.NAMES, "")
+    names = await asks(requests.NAMES, "")
     assert [name in names for name in ("/arm/speed", "/arm/deep/x", "secret", "/other")] == [True, True, False, False]
-    assert "1" in await asks(transfer.GET, "/arm/speed")
+    assert "1" in await asks(requests.GET, "/arm/speed")
     for key in ("/arm/secret", "/arm", "/nothing", "/other"):  # of a namespace that holds a secret no name is told
-        assert await asks(transfer.GET, key) == no(key)
-    assert await asks(transfer.DELETE, "/arm/") == no("/arm")
-    assert await asks(transfer.DELETE, "/other") == no("/other")
+        assert await asks(requests.GET, key) == no(key)
+    assert await asks(requests.DELETE, "/arm/") == no("/arm")
+    assert await asks(requests.DELETE, "/other") == no("/other")
     assert counters["permission.param"] == 6
-    assert "1" in await asks(transfer.SET, "/arm/speed", 5)
+    assert "1" in await asks(requests.SET, "/arm/speed", 5)
     changed: XmlRpcValue = {"speed": 6, "secret": 7}
     for key, value in (("/arm/secret", 5), ("/arm", 7), ("/arm/secret/deeper", 7)):  # the secret would be lost
-        assert await asks(transfer.SET, key, value) == no(key)
-    assert await asks(transfer.SET, "/arm", changed) == no("/arm/secret"), "a name of its own words"
+        assert await asks(requests.SET, key, value) == no(key)
+    assert await asks(requests.SET, "/arm", changed) == no("/arm/secret"), "a name of its own words"
     assert owner.core.get("/arm") == {"speed": 5, "secret": 2, "deep": {"x": 3}}
-    assert await asks(transfer.DELETE, "/arm/deep") == "{}"
+    assert await asks(requests.DELETE, "/arm/deep") == "{}"
 
 
 async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() -> None:
@@ -660,7 +668,7 @@ async def test_an_error_does_not_name_a_parameter_that_the_permissions_hide() ->
     owner.core.set("/open", {"a": 1})
     owner.core.set("/secret/door", 1234)
     with pytest.raises(PeerRefused) as caught:
-        await peer.ask(transfer.GET, {"key": "/"})
+        await peer.ask(requests.GET, {"key": "/"})
     assert "secret" not in str(caught.value)
-    text = (await peer.ask(transfer.GET, {"key": "/open"}))["text"]
+    text = (await peer.ask(requests.GET, {"key": "/open"}))["text"]
     assert await read_text(text) == {"a": 1}

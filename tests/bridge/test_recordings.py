@@ -14,52 +14,32 @@ from typing import Any
 import msgspec
 import pytest
 
-from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, write_kept
-from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.bridge.recordings import KEEP, LIST, READ, REMOVE, Recordings
 from rmpa.config.peer_rules import PermissionRule
-from rmpa.config.settings import Settings, TrustSettings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.trust.permissions import Permissions
+from tests.bridge.asked_module import AskedModule
 
 NOW = 1_800_000_000 * 10**9
 
 
-class World:
-    """One module with a recorder's folder, and a peer that answers as it is told."""
+class World(AskedModule):
+    """One module with a recorder's folder, and a peer."""
 
     def __init__(self, state: Path, *rules: PermissionRule, secured: bool = False, folder: bool = True) -> None:
+        super().__init__(Settings(name="arm", state_dir=str(state)), *rules, secured=secured)
         self.folder = state / "arm" / "record"
         if folder:
             for name in (KEPT, REQUESTS):
                 (self.folder / name).mkdir(parents=True)
-        settings = Settings(name="arm", state_dir=str(state), trust=TrustSettings(rules=rules))
-        gate = PermissionGate(Permissions(settings.trust)) if secured else OPEN_GATE
-        self.handlers: dict[str, Any] = {}
-        self.asked: list[tuple[str, dict[str, Any]]] = []
-        self.answer: Any = ""
-        self.peer = SimpleNamespace(link=SimpleNamespace(name="base", guid="g"), time=LinkTime(), linked=True, peer=1)
-        self.sessions = [self.peer]
-        rpc = SimpleNamespace(
-            on_request=lambda what, handler, _: self.handlers.update({what: handler}), request=self._request
-        )
-        bridge = SimpleNamespace(
-            rpc=rpc,
-            context=BridgeContext.of(settings, gate),
-            sessions=SimpleNamespace(linked=lambda: self.sessions),
-        )
-        self.part = Recordings(bridge)  # type: ignore[arg-type] # it has what it uses
+        self.base = self.peer("base")
+        self.part = Recordings(self.bridge)
 
-    async def _request(self, _session: object, what: str, args: dict[str, Any], *_: float) -> Any:
-        self.asked.append((what, args))
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
-
-    async def ask(self, what: str, **args: Any) -> Any:
+    async def asks(self, what: str, **args: Any) -> Any:
         """What the peer is answered."""
-        return await self.handlers[what](self.peer, args)
+        handler: Any = self.handlers[what]
+        return await handler(self.base, args)
 
     async def requests(self) -> list[Kept]:
         """What the recorder is asked to keep."""
@@ -84,20 +64,20 @@ class World:
 
 async def test_all_modules_keep_and_those_that_were_away_do_it_when_they_are_back(tmp_path: Path) -> None:
     world = World(tmp_path)
-    world.answer = UnreachableError("agent", "base", "try again")
+    world.peer("base", UnreachableError("agent", "base", "try again"))
     first = await world.part.answer({"what": "keep", "why": "It fell!", "seconds": 30})
     assert first["arm"] == ""
     assert "base" in first["base"]
     (kept,) = await world.requests()
     assert kept.id.endswith("-arm-it_fell")
     assert (kept.why, kept.by_hand, kept.until - kept.since) == ("It fell!", True, 30 * 10**9)
-    world.answer, world.asked = "", []
-    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    world.base, world.asked = world.peer("base"), []
+    world.part.link_up(world.base)
     while not world.asked:
         await asyncio.sleep(0)
     assert msgspec.convert(world.asked[0][1]["kept"], Kept) == kept
     world.asked.clear()
-    world.part.link_up(world.peer)  # type: ignore[arg-type] # likewise
+    world.part.link_up(world.base)
     await world.part.close()
     assert not world.asked, "it has answered"
 
@@ -108,36 +88,36 @@ async def test_only_the_modules_that_are_named_keep_and_no_others_later(tmp_path
     assert not await world.requests()
     world.asked.clear()
     assert await world.part.answer({"what": "keep", "modules": ["arm"]}) == {"arm": ""}
-    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    world.part.link_up(world.base)
     await world.part.close()
     assert (len(await world.requests()), world.asked) == (1, [])
 
 
 async def test_a_peers_times_are_put_on_this_clock(tmp_path: Path) -> None:
     world = World(tmp_path)
-    world.peer.time = SimpleNamespace(ahead_ns=5 * 10**9)
+    world.base.time = SimpleNamespace(ahead_ns=5 * 10**9)
     kept = Kept(id="fall", why="it fell", since=NOW, until=NOW + 10**9)
-    assert await world.ask(KEEP, kept=msgspec.to_builtins(kept)) == ""
+    assert await world.asks(KEEP, kept=msgspec.to_builtins(kept)) == ""
     (found,) = await world.requests()
     assert (found.since, found.until, found.asked_by) == (NOW - 5 * 10**9, NOW - 4 * 10**9, "base")
 
 
 async def test_how_long_ago_counts_when_clocks_were_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world, hour, now = World(tmp_path), 3600 * 10**9, time.time_ns()
-    world.answer = UnreachableError("agent", "base", "try again")
+    world.peer("base", UnreachableError("agent", "base", "try again"))
     asked = Kept(id="fall", why="it fell", since=now - 60 * 10**9, until=now)
     await world.part.keep(asked)
-    world.answer, world.asked, wall = "", [], time.time_ns
+    world.base, world.asked, wall = world.peer("base"), [], time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: wall() + hour)  # this module's clock, while the peer was away
-    world.part.link_up(world.peer)  # type: ignore[arg-type] # it has what is used
+    world.part.link_up(world.base)
     while not world.asked:
         await asyncio.sleep(0)
     await world.part.close()
     sent = world.asked[0][1]
     assert sent["now"] - now < 60 * 10**9, "by the clock as it was"
     await world.requests()
-    world.peer.time = SimpleNamespace(ahead_ns=-hour)  # as the peer still knew it
-    assert await world.ask(KEEP, **sent) == ""
+    world.base.time = SimpleNamespace(ahead_ns=-hour)  # as the peer still knew it
+    assert await world.asks(KEEP, **sent) == ""
     (found,) = await world.requests()
     assert abs(found.until - (now + hour)) < 60 * 10**9
     assert found.until - found.since == 60 * 10**9
@@ -164,18 +144,18 @@ async def test_a_file_is_read_in_parts_and_nothing_beside_it(tmp_path: Path) -> 
     await asyncio.to_thread((world.folder / "secret").write_text, "x")
     found = b""
     while len(found) < len(data):
-        part = await world.ask(READ, id="fall", file="1.mcap", offset=len(found))
+        part = await world.asks(READ, id="fall", file="1.mcap", offset=len(found))
         assert part.size == len(data)
         found += base64.b64decode(part.data)
     assert found == data
-    part = await world.ask(READ, id="fall", file="1.mcap", offset=1000, size=20, check=True)
+    part = await world.asks(READ, id="fall", file="1.mcap", offset=1000, size=20, check=True)
     assert (base64.b64decode(part.data), part.before) == (data[1000:1020], zlib.crc32(data[:1000]))
-    assert (await world.ask(READ, id="fall", file="1.mcap", offset=10**7, check=True)).before == zlib.crc32(data)
+    assert (await world.asks(READ, id="fall", file="1.mcap", offset=10**7, check=True)).before == zlib.crc32(data)
     for name, file in (("fall", "../../secret"), ("fall", "recording.json"), ("..", "secret"), ("none", "1.mcap")):
         with pytest.raises(RmpaError, match=r"no file|no recording|not the name"):
-            await world.ask(READ, id=name, file=file, offset=0)
+            await world.asks(READ, id=name, file=file, offset=0)
     with pytest.raises(RmpaError, match="no file"):
-        await world.ask(READ, id="fall", file="1.mcap", offset=-1)
+        await world.asks(READ, id="fall", file="1.mcap", offset=-1)
 
 
 async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp_path: Path) -> None:
@@ -190,7 +170,7 @@ async def test_a_member_without_record_keeps_lists_reads_and_removes_nothing(tmp
     )
     for what, args in requests:
         with pytest.raises(RmpaError, match="let base use the recording"):
-            await world.ask(what, **args)
+            await world.asks(what, **args)
     assert not await world.requests()
     assert [one.id for one in (await world.part.list())[0].kept] == ["fall"]
 
@@ -200,14 +180,14 @@ async def test_a_rule_lets_a_module_have_some(tmp_path: Path) -> None:
     world = World(tmp_path, rule, secured=True)
     await world.record("fall")
     await world.record("private")
-    assert [one.id for one in (await world.ask(LIST)).kept] == ["fall"]
-    assert (await world.ask(REMOVE, id="fall")).id == "fall"
+    assert [one.id for one in (await world.asks(LIST)).kept] == ["fall"]
+    assert (await world.asks(REMOVE, id="fall")).id == "fall"
     with pytest.raises(RmpaError, match="let base use the recording"):
-        await world.ask(REMOVE, id="private")
+        await world.asks(REMOVE, id="private")
 
 
 async def test_an_earlier_release_is_named(tmp_path: Path) -> None:
     world = World(tmp_path)
-    world.answer = PeerRefused("base", "this agent does not know the question 'record.keep'")
+    world.peer("base", PeerRefused("base", "this agent does not know the question 'record.keep'"))
     answers = await world.part.answer({"what": "keep"})
     assert answers["base"]

@@ -29,7 +29,6 @@ from rmpa.ros.core.external import Core
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node import listeners as shared_listener
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.trust.permissions import Permissions
 from tests.bridge.io.virtual import VirtualLoop, run
 from tests.bridge.recorder import context
@@ -89,10 +88,7 @@ class Scene:
         self.part = Keeper(*outages)
         nodes = cast("Any", SimpleNamespace())
         self.gate = PermissionGate()
-        self.sessions = PeerSessions([*before, self.part], nodes, self._killed, self.gate)
-
-    async def _killed(self, *_: object) -> RosReply:
-        raise NotImplementedError
+        self.sessions = PeerSessions([*before, self.part], nodes, self.gate)
 
     def link(self, run_number: int = 1, *, silent: bool = True, **more: Any) -> PeerLink:
         link = cast("PeerLink", Link(run_number, silent=silent, **more))
@@ -219,7 +215,7 @@ class Nodes:
         self.problem: Exception | None = None
         self.open: list[str] = []
 
-    def make(self, name: str, _on_kill: object) -> SlaveNode:
+    def make(self, name: str) -> SlaveNode:
         async def start() -> None:
             await asyncio.sleep(0)
             if self.problem is not None:

@@ -62,9 +62,9 @@ def test_all_modules_are_asked_and_what_cannot_be_read_is_named(place: Place, ag
 
     def log(args: dict[str, Any]) -> Any:
         asked.append(args)
-        old = ModuleLog("old", problem="its agent is of an earlier release", code="other-release")
-        loud = ModuleLog("base", second, 9, ("/loud",), 0.001)
-        return (ModuleLog("arm", lines, 9, (), 0.0), loud, old)
+        old = ModuleLog(module="old", problem="its agent is of an earlier release", code="other-release")
+        loud = ModuleLog(module="base", lines=second, next=9, lost=("/loud",), error=0.001)
+        return (ModuleLog(module="arm", lines=lines, next=9, error=0.0), loud, old)
 
     agent(log=log)
     code, output, errors = place.run("log", "--level", "warn", "--node", "hand", "--since", "5m")

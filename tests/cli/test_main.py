@@ -149,8 +149,6 @@ def test_help_without_arguments_is_no_error_with_a_code(capsys: pytest.CaptureFi
         ("start", "Did you mean `rmpa up` or `rmpa resource start` or `rmpa service install`?"),
         ("--json peer list", "--json belongs after the command: rmpa peer list --json"),
         ("topic --agent base list", "--agent belongs after the command: rmpa topic list --agent"),
-        ("up --fresh", "No such option: --fresh; write --keep never"),
-        ("core --fresh", "No such option: --fresh; write --keep never"),
         *((f"{words} an-argument --an-option", f"rmpa {words}: is not a command any more; {remedy}")
           for words, remedy in REMOVED_VERBS.items()),
     ],

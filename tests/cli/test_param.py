@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import owner as requests
 from rmpa.cli.param import read_documents, read_yaml, write_yaml
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.core.embedded import RosCore
@@ -55,14 +55,14 @@ def peer(agent: Callable[..., None]) -> dict[str, Any]:
         assert args["peer"] == "base"
         key = str(args.get("key"))
         match args["what"]:
-            case transfer.GET if key not in kept:
+            case requests.GET if key not in kept:
                 raise PeerRefused("base", f"there is no parameter {key}")
-            case transfer.GET:
+            case requests.GET:
                 return {"text": serialize_response(kept[key]).decode()}
-            case transfer.NAMES:
+            case requests.NAMES:
                 return {"text": serialize_response(list(kept)).decode()}
-            case transfer.SET:
-                kept[key] = parse_response(transfer.text_of(args).encode())
+            case requests.SET:
+                kept[key] = parse_response(requests.text_of(args).encode())
                 return {"count": 1}
         del kept[key]
         return {}

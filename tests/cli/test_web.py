@@ -128,10 +128,10 @@ def test_rmpa_reload_takes_other_rights_and_a_mistake_changes_nothing(place: Pla
         until(lambda: get(port, "/metrics")[0] == 401)
         token = (place.path / ".local" / "state" / "rmpa" / "base" / "web-token").read_text().strip()
         assert get(port, "/metrics", token)[0] == 200
-        config.write_text(f'{web}[[web_token]]\nname = "wall"\n')
+        config.write_text(f'{web}token = "wall"\n')
         code, _, err = place.run("reload")
         assert code != 0
-        assert "use the one token; control and drive of [web]" in err
+        assert "web.token: an unknown key" in err
         assert get(port, "/metrics", token)[0] == 200
         assert child_of(agent.pid) == pid
 

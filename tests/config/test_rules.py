@@ -82,11 +82,6 @@ def test_names_that_become_one_or_each_other_s_are_taken(load: Load) -> None:
     assert load(f"{PEER}remap_in = {{'/a' = '/c', '/b' = '/c', '/x' = '/y', '/y' = '/x'}}").notes == ()
 
 
-def test_the_second_spelling_of_renamings_says_what_to_write(refuse: Refuse) -> None:
-    says = refuse(PEER + "[[peer.remap]]\ndirection = 'in'\nfrom = '/a'\nto = '/b'")
-    assert says.startswith('rmpa.toml:3: peer.remap: an unknown key; write remap_in = { "FROM" = "TO" } for')
-
-
 def test_one_prefix_for_many_peers_is_doubtful(load: Load) -> None:
     [note] = load("[[peer]]\nname = 'r*'\nprefix = '/r'\n").notes
     assert ":3: peer.prefix: /r is one place for every peer that r* fits; /{peer} would keep them apart" in note
@@ -310,9 +305,6 @@ def test_a_size_has_the_units_of_files_and_of_links(load: Load, size: str, expec
         ("[gateway]\nlisten = ['tcp/a:70000']", 2, "no port between 1 and 65535"),
         ("[gateway]\nlisten = ['tcp/a:1', 'tcp/a b:1']", 2, "is not an endpoint of Zenoh"),
         ("[gateway]\nconnect = 'tcp/a:1'", 2, 'did you mean ["tcp/a:1"]?'),
-        ("[gateway]\nstore = 'last.db'", 2, "an unknown key; no gateway keeps values"),
-        ("[[gateway.rule]]\nrate = 1\nkeep = true", 3, "gateway.rule.keep: an unknown key; no gateway keeps values"),
-        ("[gateway]\nros1_bridge = true", 2, "an unknown key; let a gateway with a site name join those robots"),
         ("[gateway]\nsites = 'a'", 2, "did you mean gateway.site?"),
         ("[gateway]\nenabled = true", 2, "unknown key"),
         ("[gateway]\nros2 = true", 2, "gateway.ros2: true is not a table"),

@@ -245,13 +245,6 @@ def test_settings_of_the_other_kind_of_core_are_reported(load: Load) -> None:
     assert notes == ("--core-port: is of no use with an external core", "--keep: is of no use with an external core")
 
 
-def test_what_is_gone_says_what_to_use(load: Load) -> None:
-    with pytest.raises(ConfigError, match=r'rmpa\.toml:2: core\.fresh: an unknown key; write keep = "never"'):
-        load("[core]\nfresh = true\n")
-    with pytest.raises(ConfigError, match=r"RMPA_FRESH: is not a variable any more; set RMPA_KEEP=never"):
-        load("", environ={"RMPA_FRESH": "1"})
-
-
 @pytest.mark.parametrize(
     ("environ", "expected"),
     [

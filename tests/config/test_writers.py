@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from rmpa.config.read import INSECURE, load_settings
-from rmpa.config.writers import other_writer
+from rmpa.config.toml_file import other_writer
 from rmpa.core.errors import ConfigError
 from rmpa.gateway.ros2.pairs import TypeMapping
 

@@ -9,8 +9,7 @@ import msgspec
 
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.messages import Message, Request, Response
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.transfer import key_problem
+from rmpa.bridge.params.owner import count_of, key_problem, text_of
 from rmpa.bridge.rpc import LinkRequests, PeerRpc
 from rmpa.core.errors import RmpaError
 from rmpa.core.statistics import Counters
@@ -44,7 +43,7 @@ def fuzz(data: bytes) -> None:
         str(error)
     for message in taken:
         said = message.args if isinstance(message, Request) else cast("Response", message).value
-        for read in (transfer.text_of, transfer.count_of):
+        for read in (text_of, count_of):
             try:
                 read(said)
             except RmpaError as error:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rmpa.config.recording import RecordSettings
+from rmpa.config.settings import RecordSettings
 from rmpa.core.facts import TopicInfo
 from rmpa.record.capture import Capture
 from rmpa.ros.core.embedded import RosCore

@@ -109,8 +109,6 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
-        if trust is not None:
-            trust.identity = self.identity
         self._members: set[Guid] = set()
         self.mesh = Mesh(
             self.identity,
@@ -245,31 +243,26 @@ class Network:
     async def _leave(self, *, moves: bool = False) -> None:
         if self.endpoint is not None:
             endpoint, self.endpoint = self.endpoint, None
-            if self.trust is not None:
-                self.trust.identity = None
             await endpoint.close(moves=moves)
 
     def move(self) -> None:
         """Take a new GUID, with an address that the machine has."""
-        if self._moving is None:
+        if self._moving is None or self._moving.done():
             self._moving = start_task(self._move(), "move to the new address")
 
     async def _move(self) -> None:
-        try:
-            port = self.endpoint.port if self.endpoint is not None else self.settings.port
-            _log.info("= the machine's addresses have changed: taking a new GUID")
-            joined = False
-            while not joined and not self._over.is_set():
-                try:
-                    await self._leave(moves=True)
-                    await self._join(port)
-                    joined = True
-                except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed
-                    _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
-        finally:
-            self._moving = None
+        port = self.endpoint.port if self.endpoint is not None else self.settings.port
+        _log.info("= the machine's addresses have changed: taking a new GUID")
+        joined = False
+        while not joined and not self._over.is_set():
+            try:
+                await self._leave(moves=True)
+                await self._join(port)
+                joined = True
+            except Exception as error:  # noqa: BLE001 - until it has joined, no change of an address is noticed
+                _log.warning("! cannot join the mesh with the new address; tried again: %s [cannot-start]", error)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._over.wait(), JOIN_RETRY)
 
 
 def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
@@ -463,7 +456,9 @@ class Agent:
         self.why = WhyService(settings.name, facts, self.snapshots, self.sites)
         answers = nodes, self.sites, rates
         self.operations = ControlOperations(settings.name, facts, self.params, self.snapshots, *answers)
-        self.trust_commands = TrustCommands(settings, self.trust)
+        self.trust_commands = TrustCommands(
+            settings, self.trust, lambda: at.identity if (at := self.network.endpoint) else None
+        )
         handlers: dict[str, Handler] = {
             **self.operations.handlers(),
             "why": self.why.answer,
@@ -547,7 +542,7 @@ class Agent:
                 sock.close()
 
     def apply_settings(self, settings: Settings) -> None:
-        """Take settings that were read again; only those of ``agent.process.LIVE`` differ."""
+        """Take settings that were read again; only live ones differ."""
         before, self.settings = self.settings, settings
         if not before.allows_direct:
             self._warn_of_stale_connections()
@@ -564,17 +559,21 @@ async def _serve(
     started: Callable[[], None] = lambda: None,
 ) -> None:
     agent = Agent(settings, realtime, load)
-    web, recorder = ChildProcess.web(settings, random.random), ChildProcess.recorder(settings, random.random)
+    web = ChildProcess.web(settings, random.random)
+    recorder = ChildProcess("record", "recording-stopped", settings, random.random)
     agent.reloaded = web.reload
 
     async def start() -> None:
         await agent.start()
         await asyncio.to_thread(started)
         for child, wanted in ((web, settings.web.enabled), (recorder, settings.record.enabled)):
-            await (child.start() if wanted else child.close())
+            if wanted:
+                child.begin()
+            else:
+                await child.stop()  # an agent before may have left it
 
     async def close() -> None:
-        await asyncio.gather(web.close(), recorder.close())
+        await asyncio.gather(web.stop(), recorder.stop())
         await agent.close()
 
     await serve(start, close, agent.reloader)

@@ -51,6 +51,8 @@ from rmpa.trust.permissions import (
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
@@ -118,7 +120,6 @@ class AgentTrust(Part):
         StartError: A file of the authority is broken.
 
     Attributes:
-        identity: This module's place in the network; ``None`` while it has none.
         authority: What the authority has; ``None``: this module is not it.
         joins: The joins at the authority.
     """
@@ -130,7 +131,6 @@ class AgentTrust(Part):
         from rmpa.trust.membership import MeshAuthority  # noqa: PLC0415 - as in ``open_membership``
 
         self.membership = membership
-        self.identity: Identity | None = None
         self._settings = settings
         self._bridge = bridge
         self._clock = clock
@@ -366,11 +366,13 @@ class TrustCommands:
     Args:
         settings: The agent's.
         part: Its part in a secured mesh; ``None``: trust is off.
+        place: This module's place in the network; ``None`` while it has none.
     """
 
-    def __init__(self, settings: Settings, part: AgentTrust | None) -> None:
+    def __init__(self, settings: Settings, part: AgentTrust | None, place: Callable[[], Identity | None]) -> None:
         self._settings = settings
         self._part = part
+        self._own_place = place
 
     async def answer_command(self, args: Args) -> object:
         """``what``: the name of one of the methods below; the other arguments are its own.
@@ -419,7 +421,7 @@ class TrustCommands:
 
     def _place(self, args: Args) -> tuple[str, int]:
         """Where a joining module reaches this one: as the user says, else as beacons say."""
-        identity, address, port = self._trust.identity, args.get("address"), args.get("port")
+        identity, address, port = self._own_place(), args.get("address"), args.get("port")
         if identity is None:
             raise UnreachableError("network", "this agent", "it has no address at this moment; try again")
         return str(address or identity.guid.address), port if isinstance(port, int) else identity.guid.port

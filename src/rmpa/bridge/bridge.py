@@ -73,7 +73,7 @@ class Bridge:
         self.gate = PermissionGate(permissions, self.counters)
         self.context = BridgeContext.of(settings, self.gate)
         self.rpc = PeerRpc(self.counters)
-        kills = ProxyKills(self.rpc)
+        kills = ProxyKills(self)
         self.node = SlaveNode(
             OWN_NODE,
             core.node_host,
@@ -84,10 +84,10 @@ class Bridge:
             on_kill=kills.own,
             taps=lambda: self.topics.exports.connections,
         )
-        self.proxy_nodes = ProxyNodes(core, self.counters)
+        self.proxy_nodes = ProxyNodes(core, self.counters, kills.proxy)
         self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
-        self.sessions = PeerSessions(self._parts, self.proxy_nodes, kills.proxy, self.gate)
+        self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.gate)
         self.relay = Relay(enabled=settings.relay)
         self.topics = Topics(self)
         self.log = ModuleLogs(self)

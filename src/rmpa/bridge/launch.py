@@ -13,27 +13,32 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-
 from rmpa.bridge import limits
-from rmpa.bridge.launch_files import REFUSED, LaunchFile, circles, is_name, list_files
-from rmpa.bridge.launched import ModuleResources, ResourceProgram, load_runs
+from rmpa.bridge.launched import (
+    REFUSED,
+    LaunchFile,
+    ModuleResources,
+    ResourceProgram,
+    circles,
+    is_name,
+    list_files,
+    load_runs,
+)
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import why_unanswered
+from rmpa.bridge.rpc import meant, no_such_module
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import suggestion
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import is_meant
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.files import replace_file
-from rmpa.runtime.programs import RUNS, CpuShares, ProgramMark
+from rmpa.runtime.kept_program import ProgramNote
+from rmpa.runtime.programs import RUNS, CpuShares
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 from rmpa.trust.permissions import PermissionDecision, asker_name, refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
@@ -47,21 +52,10 @@ LIST: Final = "list"
 LOG: Final = "log"
 # What can be asked for, with what the log says of it.
 ACTS: Final = {LIST: "", "start": "starts", "stop": "stops", "restart": "restarts", LOG: ""}
-# In the folder of ``RUNS``: the processes that the agent has started. No resource is named so.
-_OWN_FILE: Final = ".agent.json"
 # Seconds between two looks at what resources tell of themselves, while a start waits for it.
 _LOOK: Final = 0.1
 # Seconds between two looks whether the conditions of a start at boot hold.
 _BOOT_LOOK: Final = 0.5
-_EARLIER: Final = "its agent is of an earlier release, which starts nothing; install this release there"
-
-
-class _Kept(msgspec.Struct, frozen=True):
-    """A process as the agent's file has it."""
-
-    mark: ProgramMark
-    file: str
-    restarts: int = 0
 
 
 class Launcher(Part):
@@ -81,7 +75,6 @@ class Launcher(Part):
         self._waiting: dict[str, StartRule] = {}
         self._work = OwnedTasks()
         self._main: asyncio.Task[None] | None = None
-        self._writes = asyncio.Lock()
         self.shares = CpuShares()
         bridge.rpc.on_request(LAUNCH, self._asked, Needs((Access.LAUNCH,), "the resource; lists leave others out"))
 
@@ -98,17 +91,20 @@ class Launcher(Part):
         await asyncio.gather(*(one.stop() for one in self._launched.values()))
 
     @property
+    def _name(self) -> str:
+        return self._bridge.context.settings.name
+
+    @property
     def _folder(self) -> Path:
         """The folder of this module's resources.
 
         Raises:
             RmpaError: The settings name none.
         """
-        settings = self._bridge.context.settings
-        if not settings.resources.folder:
-            text = f"{settings.name} starts nothing: set folder of [resources] in its rmpa.toml"
+        if not (folder := self._bridge.context.settings.resources.folder):
+            text = f"{self._name} starts nothing: set folder of [resources] in its rmpa.toml"
             raise RmpaError(text, code=REFUSED)
-        return Path(settings.resources.folder).expanduser()
+        return Path(folder).expanduser()
 
     @property
     def _state(self) -> Path:
@@ -139,35 +135,17 @@ class Launcher(Part):
     async def _adopt(self) -> None:
         """Take over the processes that an agent before has started."""
         try:
-            path = self._state / RUNS / _OWN_FILE
-            kept = msgspec.json.decode(await asyncio.to_thread(path.read_bytes), type=dict[str, _Kept])
-        except (OSError, msgspec.DecodeError, RmpaError):
+            notes = await asyncio.to_thread(_load_notes, self._state)
+        except RmpaError:
             return
-        for name, former in kept.items():
-            self._of(name, self._folder / former.file).adopt(former.mark, former.restarts, self._bridge.core.uri)
-
-    async def _note(self) -> None:
-        """Keep which processes run, for the next agent."""
-        kept = {
-            name: _Kept(one.mark, one.path.name, one.restarts)
-            for name, one in self._launched.items()
-            if one.mark is not None
-        }
-        path = self._state / RUNS / _OWN_FILE
-
-        def save() -> None:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            replace_file(path, msgspec.json.encode(kept))
-
-        async with self._writes:
-            try:
-                await asyncio.to_thread(save)
-            except OSError as error:
-                _log.warning("! what runs cannot be noted for the next agent: %s [directory-unusable]", error)
+        for name, note in notes.items():
+            one = self._of(name, self._folder / note.made_of[0])
+            if not one.runs:
+                one.adopt(note)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
         if name not in self._launched:
-            self._launched[name] = ResourceProgram(name, path, self._state, self._bridge.rng, self._note)
+            self._launched[name] = ResourceProgram(name, path, self._state, self._bridge)
         self._launched[name].path = path
         return self._launched[name]
 
@@ -240,7 +218,11 @@ class Launcher(Part):
         if other is not None and other.process.runs and other.process != one.mark:
             text = f"it runs already, and was started by hand (process {other.process.pid})"
             raise RmpaError(text, code=REFUSED)
-        await one.start(self._bridge.core.uri)
+        try:
+            await one.start()
+        except OSError as error:
+            one.state, one.why = "failed", f"cannot be started: {error.strerror}"
+            raise RmpaError(f"{one.name} {one.why}", code="resource-stopped") from None
 
     async def starters(self) -> dict[str, str]:
         """The resources that have started nodes of this module, by node."""
@@ -250,27 +232,37 @@ class Launcher(Part):
             return {}
         return {node.node: name for name, run in runs.items() for node in run.nodes if node.mark and node.mark.runs}
 
-    async def _asked(self, asker: PeerSession, args: dict[str, Any]) -> ModuleResources:
-        """Answer a peer: only a name crosses, and it is judged before anything is read."""
-        peer, context = asker.link.name, self._bridge.context
-        gate, what, name = context.gate, args.get("what"), args.get("name")
-        if not gate.on and not context.settings.resources.open:
+    async def _asked(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleResources:
+        """Answer a peer, or a program of this machine; a problem is a part of the answer.
+
+        Of a peer only a name crosses, and it is judged before anything is read.
+
+        Raises:
+            RmpaError: The peer may not.
+        """
+        if asker is not None:
+            self._check(asker, args.get("what"), args.get("name"))
+        try:
+            return await self._do(asker, args)
+        except RmpaError as error:
+            if error.code == "not-permitted":
+                raise
+            return ModuleResources(module=self._name, problem=str(error), code=error.code)
+
+    def _check(self, asker: PeerSession, what: object, name: object) -> None:
+        gate, peer = self._bridge.context.gate_for(asker)
+        if not gate.on and not self._bridge.context.settings.resources.open:
             rule = "the mesh is not secured, and open of [resources] is false"
             gate.refused(Access.LAUNCH, peer, "a resource", PermissionDecision(False, rule))
-            raise RmpaError(f"{context.settings.name} starts nothing for others: {rule}", code="not-permitted")
-
-        def allowed(each: str) -> bool:
-            return gate.judge(Access.LAUNCH, peer, f"/{each}").allowed
-
+            raise RmpaError(f"{self._name} starts nothing for others: {rule}", code="not-permitted")
         if what == LIST:
-            return await self._do(args, allowed, peer)
+            return
         if not is_name(name):
             raise RmpaError("the request names no resource: letters, digits and _", code="unknown-name")
         if why := gate.why_not(Access.LAUNCH, peer, f"/{name}"):
             raise RmpaError(why, code="not-permitted")
         if verb := ACTS.get(str(what)):
             _log.info("= %s %s resource %s", asker_name(peer), verb, name)
-        return await self._do(args, allowed)
 
     async def answer(self, args: Mapping[str, Any]) -> list[ModuleResources]:
         """Answer a program of this machine: ``what`` of the resource ``name``, here or at a peer, a ``module``.
@@ -278,64 +270,43 @@ class Launcher(Part):
         Without a module a list is that of all modules, and everything else is about this one.
         """
         request = {key: args[key] for key in ("what", "name", "after", "lines") if args.get(key) is not None}
-        own, module = self._bridge.context.settings.name, args.get("module")
-        sessions = [*self._bridge.sessions.linked()]
+        sessions, module = [*self._bridge.sessions.linked()], args.get("module")
         if module is None and request.get("what") == LIST:
-            return [await self._do(request), *await asyncio.gather(*(self._ask(one, request) for one in sessions))]
-        if module is None or module == own:
-            return [await self._do(request)]
-        fitting = [one for one in sessions if is_meant(str(module), one.link.name, str(one.link.guid))]
-        if not fitting:
-            names = [own, *(one.link.name for one in sessions)]
-            near = suggestion(str(module), names, "`rmpa peer list` shows which modules are there")
-            problem = f"no linked module has this name; {near}"
-            return [ModuleResources(module=str(module), problem=problem, code="unknown-name")]
-        return [await self._ask(fitting[0], request)]
+            others = (self._ask(one, request) for one in sessions)
+            return [await self._asked(None, request), *await asyncio.gather(*others)]
+        if module in (None, self._name):
+            return [await self._asked(None, request)]
+        if fitting := meant(sessions, module):
+            return [await self._ask(fitting[0], request)]
+        error = no_such_module(str(module), self._name, sessions)
+        return [ModuleResources(module=str(module), problem=str(error), code=error.code)]
 
     async def _ask(self, session: PeerSession, request: dict[str, Any]) -> ModuleResources:
-        name = session.link.name
         quick = request.get("what") in (LIST, LOG)
-        try:
-            timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
-            value = await self._bridge.rpc.request(session, LAUNCH, request, timeout)
-            return msgspec.structs.replace(msgspec.convert(value, ModuleResources), module=name)
-        except (RmpaError, msgspec.ValidationError) as error:
-            problem, code = why_unanswered(error, _EARLIER)
-        return ModuleResources(module=name, problem=problem, code=code)
+        timeout = limits.ASK_TIMEOUT if quick else limits.LAUNCH_ASK_TIMEOUT
+        return await self._bridge.rpc.ask(session, LAUNCH, request, ModuleResources, timeout)
 
-    async def _do(
-        self, args: Mapping[str, Any], allowed: Callable[[str], bool] = lambda _name: True, peer: str = ""
-    ) -> ModuleResources:
-        """What is asked for, in this module; a problem is a part of the answer.
-
-        Raises:
-            RmpaError: A peer asks for a list, and may not have any resource.
-        """
-        module, what, name = self._bridge.context.settings.name, str(args.get("what")), args.get("name")
+    async def _do(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleResources:
+        what, name, (gate, peer) = str(args.get("what")), args.get("name"), self._bridge.context.gate_for(asker)
         if what not in ACTS:
-            text = f"{what[:64]!r} is no question; there are {', '.join(ACTS)}"
-            return ModuleResources(module=module, problem=text, code="invalid-value")
-        try:
-            files = await self._files()
-            if what == LIST:
-                runs = await asyncio.to_thread(load_runs, self._state)
-                wanted = [file for file in files.values() if allowed(file.name)]
-                told = tuple(self._of(file.name, file.path).told(file, runs, self.shares) for file in wanted)
-                if not files or told or not peer:
-                    return ModuleResources(module=module, resources=told)
-            elif not is_name(name) or (str(name) not in files and str(name) not in self._launched):
-                near = suggestion(str(name), filter(allowed, files), "`rmpa resource list` shows what can be started")
-                problem = f"{module} has no file of a resource {str(name)[:64]!r}; {near}"
-                return ModuleResources(module=module, problem=problem, code="unknown-name")
-            elif what == LOG:
-                one = self._launched.get(str(name)) or self._of(str(name), files[str(name)].path)
-                logs = await asyncio.to_thread(one.logs, args.get("after"), args.get("lines"))
-                return ModuleResources(module=module, logs=tuple(logs))
-            else:
-                return await self._act(what, str(name), files)
-        except RmpaError as error:
-            return ModuleResources(module=module, problem=str(error), code=error.code)
-        raise RmpaError(refusal(Access.LAUNCH, peer, "any resource"), code="not-permitted")
+            raise RmpaError(f"{what[:64]!r} is no question; there are {', '.join(ACTS)}", code="invalid-value")
+        files = await self._files()
+        permitted = [one for one in files.values() if gate.judge(Access.LAUNCH, peer, f"/{one.name}").allowed]
+        if what == LIST:
+            if files and not permitted:
+                raise RmpaError(refusal(Access.LAUNCH, peer, "any resource"), code="not-permitted")
+            runs = await asyncio.to_thread(load_runs, self._state)
+            told = tuple(self._of(file.name, file.path).told(file, runs, self.shares) for file in permitted)
+            return ModuleResources(module=self._name, resources=told)
+        if not is_name(name) or (str(name) not in files and str(name) not in self._launched):
+            known = [file.name for file in permitted]
+            near = suggestion(str(name), known, "`rmpa resource list` shows what can be started")
+            raise RmpaError(f"{self._name} has no file of a resource {str(name)[:64]!r}; {near}", code="unknown-name")
+        if what != LOG:
+            return await self._act(what, str(name), files)
+        one = self._launched.get(str(name)) or self._of(str(name), files[str(name)].path)
+        logs = await asyncio.to_thread(one.logs, args.get("after"), args.get("lines"))
+        return ModuleResources(module=self._name, logs=tuple(logs))
 
     async def _act(self, what: str, name: str, files: Mapping[str, LaunchFile]) -> ModuleResources:
         """Start, stop or restart a resource; return when that is done, or has failed, or takes long."""
@@ -346,12 +317,11 @@ class Launcher(Part):
         if change.done():
             change.result()
         told = one.told(file, await asyncio.to_thread(load_runs, self._state), self.shares)
-        module, problem = self._bridge.context.settings.name, ""
-        if what != "stop" and told.state == "failed":
-            logs = await asyncio.to_thread(one.logs, None, 1)
-            problem = f"{name} {told.why}; its log ends: {' '.join(logs[0].lines)}"
-        code = "resource-stopped" if problem else ""
-        return ModuleResources(module=module, resources=(told,), problem=problem, code=code)
+        if what == "stop" or told.state != "failed":
+            return ModuleResources(module=self._name, resources=(told,))
+        logs = await asyncio.to_thread(one.logs, None, 1)
+        problem = f"{name} {told.why}; its log ends: {' '.join(logs[0].lines)}"
+        return ModuleResources(module=self._name, resources=(told,), problem=problem, code="resource-stopped")
 
     async def _change(self, what: str, one: ResourceProgram) -> None:
         if what != "start":
@@ -369,3 +339,9 @@ class Launcher(Part):
             if self._is_active(one.name, await asyncio.to_thread(load_runs, self._state)):
                 return
             await asyncio.sleep(_LOOK)
+
+
+def _load_notes(state: Path) -> dict[str, ProgramNote]:
+    """The notes of the programs that run, by the names of their resources; reads the disk."""
+    notes = {path.name[1:-5]: ProgramNote.load(path) for path in (state / RUNS).glob(".*.json")}
+    return {name: note for name, note in notes.items() if note is not None and note.mark.runs}

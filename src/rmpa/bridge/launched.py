@@ -1,46 +1,160 @@
-"""One resource that the agent starts: its process ``rmpa run``, and what is told of it and of its nodes."""
+"""The resources that an agent can start: their files, the process ``rmpa run`` of each, and what is told of them.
+
+The files are those of one folder, which others cannot write.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import os
-import time
-from typing import TYPE_CHECKING, Any, Final
+import re
+import stat
+import tomllib
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.config.toml_file import other_writer
+from rmpa.config.values import BadValue, read_duration
 from rmpa.core.errors import RmpaError
+from rmpa.core.facts import ModuleAnswer
 from rmpa.core.timers import Backoff
 from rmpa.runtime.interpreter import own_command
+from rmpa.runtime.kept_program import KeptProgram
 from rmpa.runtime.programs import (
     LOGS,
     RUNS,
-    ProgramMark,
     ResourceRun,
-    end_program,
-    ended,
+    StartRule,
     figures,
-    how_ended,
     read_log,
     rotate_log,
     start_program,
 )
 from rmpa.runtime.systemd import SERVICE_VARIABLES
-from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     import subprocess
-    from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from rmpa.bridge.launch_files import LaunchFile
-    from rmpa.runtime.programs import CpuShares
+    from rmpa.bridge.bridge import Bridge
+    from rmpa.runtime.programs import CpuShares, ProgramMark
 
-_log = logging.getLogger(__name__)
-# The exit code of a command that cannot run as it is written: another start would end alike.
-_USAGE: Final = 2
+REFUSED: Final = "launch-refused"
+_TOML: Final = ".resource.toml"
+_PYTHON: Final = ".py"
+_NAME: Final = re.compile("[A-Za-z][A-Za-z0-9_]{0,63}")
+
+
+class LaunchFile(NamedTuple):
+    """A file of the folder.
+
+    Attributes:
+        name: By which it is started: the file's name without its ending.
+        path: The file.
+        problem: Why it is not started, and what to do; empty: it may be.
+        rule: When the agent starts it by itself.
+    """
+
+    name: str
+    path: Path
+    problem: str = ""
+    rule: StartRule = StartRule()
+
+
+def is_name(name: object) -> bool:
+    """Whether something can be the name of a resource: no path, no command, nothing of a shell."""
+    return isinstance(name, str) and _NAME.fullmatch(name) is not None
+
+
+def list_files(folder: Path, environ: Mapping[str, str]) -> dict[str, LaunchFile]:
+    """The files of resources in a folder, by the names of the resources; reads the disk.
+
+    Args:
+        folder: The folder.
+        environ: As for ``other_writer``.
+
+    Raises:
+        RmpaError: It cannot be read, or another user may write it.
+    """
+    try:
+        if found := other_writer(folder, environ):
+            raise RmpaError(f"{found[0]}; {found[1]}", code=REFUSED)
+        with os.scandir(folder) as entries:
+            paths = [folder / entry.name for entry in entries]
+    except OSError as error:
+        text = f"the folder {folder} of [resources] cannot be read: {error.strerror}"
+        raise RmpaError(text, code=REFUSED) from None
+    files: dict[str, LaunchFile] = {}
+    imported = _first_problem((each for each in paths if each.suffix == _PYTHON or _is_folder(each)), environ)
+    for path in sorted(paths)[: limits.LAUNCH_FILES_MAX]:
+        ending = next((each for each in (_TOML, _PYTHON) if path.name.endswith(each)), "")
+        if not ending:
+            continue
+        name = path.name.removesuffix(ending)
+        problem = _problem(path, environ) or (imported if ending == _PYTHON else "")
+        if not is_name(name):
+            problem = "the name of its file is not of 64 letters, digits and _ at most; rename it"
+        if name in files:
+            problem = f"{files[name].path.name} and {path.name} have one name; rename one"
+        rule = StartRule()
+        if not problem and ending == _TOML:
+            rule, problem = _read_rule(path)
+        files[name] = LaunchFile(name, path, problem, rule)
+    return files
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and path.name != "__pycache__"
+
+
+def _first_problem(paths: Iterable[Path], environ: Mapping[str, str]) -> str:
+    """Why nothing of Python is run from the folder, where a file imports the others."""
+    return next((problem for path in paths if (problem := _problem(path, environ, folder=True))), "")
+
+
+def _problem(path: Path, environ: Mapping[str, str], *, folder: bool = False) -> str:
+    """Why a file is not used; empty: it may be."""
+    try:
+        mode = path.lstat().st_mode
+        if stat.S_ISLNK(mode):
+            return f"{path.name} is a symbolic link; put the file itself into the folder"
+        if not stat.S_ISREG(mode) and not (folder and stat.S_ISDIR(mode)):
+            return f"{path.name} is not a regular file"
+        found = other_writer(path, environ)
+    except OSError as error:
+        return f"{path.name}: {error.strerror}"
+    return f"{found[0]}; {found[1]}" if found else ""
+
+
+def _read_rule(path: Path) -> tuple[StartRule, str]:
+    """The table ``[start]`` of a file; what else is wrong with the file its start will tell."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(limits.LAUNCH_FILE_BYTES).decode()
+        table: dict[str, Any] = tomllib.loads(text).get("start", {})
+        raw = table.get("delay", 0)
+        delay = read_duration(raw, "a delay") if raw not in (0, "0 s") else 0.0
+        topics, after = (tuple(map(str, table.get(key, ()))) for key in ("topics", "after"))
+        return StartRule(table.get("boot") is True, delay or 0.0, topics, after), ""
+    except (OSError, ValueError, AttributeError, TypeError, BadValue) as error:
+        return StartRule(), f"its table [start] cannot be read: {error}"
+
+
+def circles(rules: Mapping[str, StartRule]) -> dict[str, str]:
+    """The resources that wait for themselves, by ``after``, each with the way round: ``a after b after a``."""
+    found = {}
+    for name in rules:
+        ways: list[tuple[str, ...]] = [(name,)]
+        while ways and name not in found:
+            way = ways.pop()
+            for other in rules[way[-1]].after if way[-1] in rules else ():
+                if other == name:
+                    found[name] = " after ".join((*way, name))
+                elif other not in way:
+                    ways.append((*way, other))
+    return found
 
 
 class LaunchedProcess(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,138 +219,62 @@ class ResourceLog(msgspec.Struct, frozen=True, kw_only=True):
     next: int = 0
 
 
-class ModuleResources(msgspec.Struct, frozen=True, kw_only=True):
+class ModuleResources(ModuleAnswer, frozen=True, kw_only=True):
     """What one module answers.
 
     Attributes:
-        module: Its name.
-        problem: Why it was not done; empty: it was.
-        code: The problem's code.
         resources: Those that were asked for.
         logs: Those of the resource that was asked for.
     """
 
-    module: str
-    problem: str = ""
-    code: str = ""
     resources: tuple[LaunchedResource, ...] = ()
     logs: tuple[ResourceLog, ...] = ()
 
 
-class ResourceProgram:
+class ResourceProgram(KeptProgram):
     """A resource that the agent starts, and starts again when it fails.
 
     Args:
         name: Its name.
         path: Its file.
         state: The folder of the module's state, which is named as the module.
-        rng: Uniform numbers in [0, 1), for the delays.
-        note: Keeps which processes run, for the next agent.
+        bridge: The core that its nodes have.
 
     Attributes:
-        mark: Its process, or the last one.
-        state: ``stopped``, ``waiting``, ``starting``, ``stopping``, ``failed``; what it tells itself goes first.
-        why: The reason, as a text.
+        state: As of ``KeptProgram``, or ``waiting``; what it tells itself goes first.
     """
 
-    def __init__(
-        self, name: str, path: Path, state: Path, rng: Callable[[], float], note: Callable[[], Awaitable[None]]
-    ) -> None:
+    may_end = True
+
+    def __init__(self, name: str, path: Path, state: Path, bridge: Bridge) -> None:
+        backoff = Backoff(limits.LAUNCH_RESTART_FIRST, limits.LAUNCH_RESTART_MAX, bridge.rng)
+        note = state / RUNS / f".{name}.json"
+        super().__init__(f"resource {name}", "resource-stopped", note, backoff, limits.LAUNCH_END)
         self.name = name
         self.path = path
-        self.state = "stopped"
-        self.why = ""
-        self.restarts = 0
-        self.mark: ProgramMark | None = None
         self._directory = state
-        self._note = note
-        self._child: subprocess.Popen[bytes] | None = None  # ``None`` too if an agent before has started it
-        self._keeper: asyncio.Task[None] | None = None
-        self._one = asyncio.Lock()
-        self._backoff = Backoff(limits.LAUNCH_RESTART_FIRST, limits.LAUNCH_RESTART_MAX, rng)
+        self._core = bridge.core
 
     @property
-    def runs(self) -> bool:
-        """Whether its process runs."""
-        return self.mark is not None and self.mark.runs
+    def made_of(self) -> tuple[str, ...]:
+        """As of ``KeptProgram``: the base name of its file."""
+        return (self.path.name,)
 
-    def adopt(self, mark: ProgramMark, restarts: int, master: str) -> None:
-        """Take over the process that an agent before has started."""
-        self.mark, self.restarts = mark, restarts
-        if self.runs and self._keeper is None:
-            _log.info("= resource %s (process %d) goes on, of the agent before", self.name, mark.pid)
-            self._keeper = start_task(self._keep(master), f"keep resource {self.name}")
-
-    async def start(self, master: str) -> None:
-        """Start it if it does not run; ``master`` is the URI of the core.
-
-        Raises:
-            RmpaError: It cannot be started.
-        """
-        async with self._one:
-            if self.runs:
-                return
-            await end_tasks(self._keeper)
-            self._backoff.reset()
-            self.restarts = 0
-            await self._spawn(master)
-            self._keeper = start_task(self._keep(master), f"keep resource {self.name}")
-
-    async def stop(self) -> None:
-        """End it with its nodes, and wait until it has ended."""
-        async with self._one:
-            await end_tasks(self._keeper)
-            self._keeper, self.state, self.why = None, "stopping", ""
-            if self.mark is not None and self.runs:
-                await end_program(self.mark, limits.LAUNCH_END)
-            if self._child is not None:
-                self._child.poll()  # it is reaped
-            runs = await asyncio.to_thread(load_runs, self._directory)  # one that was killed has left its nodes
-            left = [node.mark for run in self.its(runs) for node in run.nodes]
-            await asyncio.gather(*(end_program(mark, limits.LAUNCH_END) for mark in left if mark is not None))
-            self.state, self.why = "stopped", ""
-
-    async def _spawn(self, master: str) -> None:
-        command = own_command("run", str(self.path), "--name", self._directory.name, "--master", master)
+    def launch(self) -> subprocess.Popen[bytes]:
+        """As of ``KeptProgram``."""
+        command = own_command("run", str(self.path), "--name", self._directory.name, "--master", self._core.uri)
         command += ["--state", str(self._directory.parent)]
         environ = {name: value for name, value in os.environ.items() if name not in SERVICE_VARIABLES}
-        log, cwd = self._directory / LOGS / f"{self.name}.log", self.path.parent
+        return start_program(command, log=self._log, cwd=self.path.parent, env=environ)
 
-        async def spawn() -> None:  # not to be cancelled between the start and its note
-            self._child = await asyncio.to_thread(start_program, command, log=log, cwd=cwd, env=environ)
-            self.mark = ProgramMark.of(self._child.pid)
-            self.state, self.why = "starting", ""
-            await self._note()
+    def left(self) -> list[ProgramMark]:
+        """As of ``KeptProgram``: one that was killed has left its nodes."""
+        runs = self.its(load_runs(self._directory))
+        return [node.mark for run in runs for node in run.nodes if node.mark is not None]
 
-        try:
-            await asyncio.shield(start_task(spawn(), f"start resource {self.name}", raises=(OSError,)))
-        except OSError as error:
-            self.state, self.why = "failed", f"cannot be started: {error.strerror}"
-            raise RmpaError(f"{self.name} {self.why}", code="resource-stopped") from None
-
-    async def _keep(self, master: str) -> None:
-        """Start it again when it has failed."""
-        while True:
-            began = time.monotonic()
-            if self.mark is not None:
-                await ended(self.mark.pid)
-            code = self._child.poll() if self._child is not None else None
-            self.state, self.why = ("stopped" if code == 0 else "failed"), _how(code)
-            if code in (0, _USAGE):
-                _log.info("= resource %s %s", self.name, self.why)
-                return
-            if time.monotonic() - began >= limits.LAUNCH_STEADY:
-                self._backoff.reset()
-            delay = self._backoff.delay()
-            text = "! resource %s %s; it is started again in %.1f s [resource-stopped]"
-            _log.warning(text, self.name, self.why, delay)
-            self.why += f"; it is started again in {delay:.0f} s"
-            await asyncio.sleep(delay)
-            self.restarts += 1
-            try:
-                await self._spawn(master)
-            except RmpaError as error:
-                _log.warning("! %s [%s]", error, error.code)
+    @property
+    def _log(self) -> Path:
+        return self._directory / LOGS / f"{self.name}.log"
 
     def its(self, runs: Mapping[str, ResourceRun]) -> list[ResourceRun]:
         """What the resources of its process tell; a file of Python may have several."""
@@ -275,7 +313,7 @@ class ResourceProgram:
 
     def rotate(self) -> None:
         """Rotate its log if it is large."""
-        rotate_log(self._directory / LOGS / f"{self.name}.log")
+        rotate_log(self._log)
 
     def logs(self, after: object, lines: object) -> list[ResourceLog]:
         """Lines of its logs and of those of its nodes; reads the disk.
@@ -312,24 +350,13 @@ def load_runs(directory: Path) -> dict[str, ResourceRun]:
 def _processes(runs: Sequence[ResourceRun], shares: CpuShares) -> Iterator[LaunchedProcess]:
     for node in (node for run in runs for node in run.nodes):
         about = figures(node.pid) if node.pid else None
+        state = node.state if about is not None or node.state != "running" else "stopped"
         told = LaunchedProcess(
-            node=node.node,
-            restarts=node.restarts,
-            state=node.state if about is not None or node.state != "running" else "stopped",
-            own=node.mark is not None,
-            why=node.why,
+            node=node.node, restarts=node.restarts, state=state, own=node.mark is not None, why=node.why
         )
         if about is not None:
-            cpu = shares.of(node.pid, about)
+            cpu, since = shares.of(node.pid, about), node.since
             told = msgspec.structs.replace(
-                told, pid=node.pid, cpu=cpu, rss=about.rss, threads=about.threads, since=node.since
+                told, pid=node.pid, cpu=cpu, rss=about.rss, threads=about.threads, since=since
             )
         yield told
-
-
-def _how(code: int | None) -> str:
-    if code == 0:
-        return "ended in order"
-    if code == _USAGE:
-        return "cannot run as it is written"
-    return how_ended(code)

@@ -295,8 +295,6 @@ LAUNCH_FILE_BYTES: Final = 256 * KIB
 # Seconds until a resource that has failed is started again; each further time it is twice as long, up to the second.
 LAUNCH_RESTART_FIRST: Final = 1.0
 LAUNCH_RESTART_MAX: Final = 60.0
-# After a run of this length the next wait is the first one again.
-LAUNCH_STEADY: Final = 60.0
 # Seconds that a resource has to end, with its nodes, before it is killed; a node has 10 s by default.
 LAUNCH_END: Final = 20.0
 # Seconds that an answer waits until the resource is active or has ended, and that the asking agent waits for it: a

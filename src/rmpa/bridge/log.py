@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.log_ring import LogLines, LogQuery, LogRing, ModuleLog
+from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import why_unanswered
+from rmpa.bridge.rpc import meant, no_such_module
 from rmpa.bridge.sessions import Part
 from rmpa.config.peer_rules import Access
-from rmpa.config.values import suggestion
 from rmpa.core.errors import RmpaError
-from rmpa.core.identity import OWN_NODE, is_meant, is_own
+from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
@@ -38,12 +37,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-# The request for log lines of the module's nodes and its agent, as ``LogQuery``; the response is ``LogLines``.
+# The request for log lines of the module's nodes and its agent, as ``LogQuery``; the response is ``ModuleLog``.
 LINES: Final = "log.lines"
 # The request for the levels of a ``node``'s loggers by name; with a ``level``: that of its ``logger`` is set, and the
 # response has what was set.
 LEVEL: Final = "log.level"
-_EARLIER: Final = "its agent is of an earlier release, which has no log for others; install this release there"
 
 
 class _Records(logging.Handler):
@@ -87,7 +85,7 @@ class ModuleLogs(Part):
         self._handler: _Records | None = None
         self._subscription: Subscription | None = None
         bridge.rpc.on_request(LINES, self._lines, Needs((Access.LOG,), "each line's node; others are left out"))
-        bridge.rpc.on_request(LEVEL, self._level, Needs((Access.LOG,), "the node"))
+        bridge.rpc.on_request(LEVEL, self.level, Needs((Access.LOG,), "the node"))
 
     def start(self) -> None:
         """Begin to keep lines."""
@@ -142,17 +140,12 @@ class ModuleLogs(Part):
         self._core.call("registerSubscriber", OWN_NODE, subscription.topic, LOG.type, self._bridge.node.uri)
         subscription.update(list(self._core.publishers(subscription.topic).values()))
 
-    def _lines(self, asker: PeerSession, args: dict[str, Any]) -> LogLines:
-        query, peer, gate = LogQuery.of(args), asker.link.name, self._bridge.context.gate
-        if not gate.on:
-            return self._find(query)
-        allowed = {node for node in self.ring.nodes if gate.judge(Access.LOG, peer, node).allowed}
+    def _lines(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleLog:
+        query, (gate, peer) = LogQuery.of(args), self._bridge.context.gate_for(asker)
+        allowed = {node for node in self.ring.nodes if not gate.on or gate.judge(Access.LOG, peer, node).allowed}
         if not allowed and (why := gate.why_not(Access.LOG, peer, query.node or OWN_NODE)):
             raise RmpaError(why, code="not-permitted")
         return self.ring.find(query, time.time_ns(), allowed.__contains__, yielding_to_data)
-
-    def _find(self, query: LogQuery) -> LogLines:
-        return self.ring.find(query, time.time_ns(), yielder=yielding_to_data)
 
     async def read(self, args: Mapping[str, Any]) -> list[ModuleLog]:
         """Log lines of this module and of its peers, which are asked at one time.
@@ -166,56 +159,44 @@ class ModuleLogs(Part):
         """
         args = dict(args)
         wanted, after = args.pop("modules", None), args.pop("after", None)
-        after = after if isinstance(after, dict) else {}
-        query, own = LogQuery.of(args), self._bridge.context.settings.name
-        sessions = [*self._bridge.sessions]
+        query = msgspec.to_builtins(LogQuery.of(args))
+        own, sessions = self._bridge.context.settings.name, [*self._bridge.sessions]
+
+        async def of(name: str, session: PeerSession | None) -> ModuleLog:
+            number = after.get(name) if isinstance(after, dict) else None
+            its = query | ({"after": number} if isinstance(number, int) and number >= 0 else {})
+            if session is not None:
+                return await self._ask(session, its)
+            if name == own:
+                return msgspec.structs.replace(self._lines(None, its), module=own, error=0.0)
+            error = no_such_module(name, own, sessions)
+            return ModuleLog(module=name, problem=str(error), code=error.code)
+
         names = map(str, wanted) if isinstance(wanted, list) else (own, *(str(one.link.guid) for one in sessions))
         asked: list[tuple[str, PeerSession | None]] = []
         for name in names:
-            found = [(one.link.name, one) for one in sessions if is_meant(name, one.link.name, str(one.link.guid))]
+            found = [(one.link.name, one) for one in meant(sessions, name)]
             asked += [(own, None)] if name == own else found or [(name, None)]
-        return await asyncio.gather(*(self._of(name, one, _since(query, after.get(name))) for name, one in asked))
+        return await asyncio.gather(*(of(*each) for each in asked))
 
-    async def _ask(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
-        """The lines of a peer, or without one of this module, if the name is that."""
-        if session is None:
-            own = self._bridge.context.settings.name
-            if name == own:
-                found = self._find(query)
-                return ModuleLog(name, found.lines, found.next, found.lost, 0.0)
-            names = [own, *(one.link.name for one in self._bridge.sessions)]
-            near = suggestion(name, names, "`rmpa peer list` shows which modules are there")
-            raise RmpaError(f"no linked module has this name; {near}", code="unknown-name")
+    async def _ask(self, session: PeerSession, query: dict[str, Any]) -> ModuleLog:
+        """The lines of a peer."""
         if not session.linked:
-            raise RmpaError("it is silent: there is no link to it now", code="peer-unlinked")
-        clock, args = session.time, msgspec.to_builtins(query)
-        value = await self._bridge.rpc.request(session, LINES, args, limits.LOG_ASK_TIMEOUT)
-        found = msgspec.convert(value, LogLines)
-        ahead, bound = clock.ahead_ns / 1e9, clock.error_ns
+            text = "it is silent: there is no link to it now"
+            return ModuleLog(module=session.link.name, problem=text, code="peer-unlinked")
+        found = await self._bridge.rpc.ask(session, LINES, query, ModuleLog, limits.LOG_ASK_TIMEOUT)
+        ahead, bound = session.time.ahead_ns / 1e9, session.time.error_ns
         lines = (msgspec.structs.replace(line, at=line.at - ahead) for line in yielding_to_data(found.lines))
-        return ModuleLog(name, (*lines,), found.next, found.lost, None if bound is None else bound / 1e9)
+        error = None if bound is None or found.problem else bound / 1e9
+        return msgspec.structs.replace(found, lines=(*lines,), error=error)
 
-    async def _of(self, name: str, session: PeerSession | None, query: LogQuery) -> ModuleLog:
-        try:
-            return await self._ask(name, session, query)
-        except (RmpaError, msgspec.ValidationError) as error:
-            problem, code = why_unanswered(error, _EARLIER)
-        return ModuleLog(name, problem=problem, code=code)
-
-    async def _level(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, str]:
-        peer = asker.link.name
-        nodes = permitted_nodes(self._bridge, Access.LOG, peer, args)
-        return await self._loggers(args, nodes, asker_name(peer))
-
-    async def level(self, args: Mapping[str, Any]) -> dict[str, str]:
+    async def level(self, asker: PeerSession | None, args: Mapping[str, Any]) -> dict[str, str]:
         """The levels of the loggers of a ``node`` of this module, by name; with ``level``: those that were set to it.
 
         Raises:
-            RmpaError: There is no such node, level or logger, or it does not answer.
+            RmpaError: There is no such node, level or logger, or it does not answer, or the asker may not.
         """
-        return await self._loggers(args, None, "this module")
-
-    async def _loggers(self, args: Mapping[str, Any], nodes: list[str] | None, who: str) -> dict[str, str]:
+        nodes = permitted_nodes(self._bridge, Access.LOG, asker, args)
         node, api = own_node(self._bridge, args, nodes, agents=True)
         uri = self._core.registrations.service_uri(f"{node}/get_loggers")
         if uri is None:
@@ -224,9 +205,6 @@ class ModuleLogs(Part):
         if not level:
             return await read_levels(uri, api, node, OWN_NODE)
         levels = await set_level(uri, node, OWN_NODE, logger, level)
+        who = asker_name(asker.link.name) if asker is not None else "this module"
         _log.info("= %s has set the level of %s of %s to %s", who, " and ".join(levels), node, level)
         return levels
-
-
-def _since(query: LogQuery, after: object) -> LogQuery:
-    return msgspec.structs.replace(query, after=after) if isinstance(after, int) and after >= 0 else query

@@ -17,6 +17,7 @@ from msgspec import Meta
 from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import ConfigError, RemoteProtocolError
+from rmpa.core.facts import ModuleAnswer
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own, matches
 from rmpa.ros.wire.log import parse_log
 
@@ -58,40 +59,20 @@ class LogLine(msgspec.Struct, frozen=True, omit_defaults=True):
     agent: bool = False
 
 
-class LogLines(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An answer of one module.
+class ModuleLog(ModuleAnswer, frozen=True, kw_only=True, omit_defaults=True):
+    """Log lines of one module, as it tells them, or as the module sees them that asks.
 
     Attributes:
-        lines: The newest that were asked for, the oldest first.
-        next: What the next question has as ``after``, to get what comes behind these.
+        lines: The newest that were asked for, the oldest first; ``at`` is by the clock of the module that has them.
+        next: What the next question has as ``after``, to get what comes behind these; 0 where there is a problem.
         lost: Nodes of which lines since ``after`` are missing: they wrote more than is kept, or than one answer has.
-    """
-
-    lines: Annotated[tuple[LogLine, ...], Meta(max_length=limits.LOG_LINES_ASKED)]
-    next: Annotated[int, Meta(ge=0, lt=2**53)]
-    lost: Annotated[tuple[str, ...], Meta(max_length=limits.LOG_LINES_ASKED)] = ()
-
-
-class ModuleLog(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Log lines of one module, as the module sees them that asks.
-
-    Attributes:
-        module: Its name.
-        lines: As of ``LogLines``; ``at`` is by the asking module's clock.
-        next: As of ``LogLines``; 0 where there is a problem.
-        lost: Likewise.
         error: The bound of the error of these times, seconds; ``None``: the two clocks are not compared yet.
-        problem: Why there are no lines, for people; empty if it answered.
-        code: That of the problem.
     """
 
-    module: str
-    lines: tuple[LogLine, ...] = ()
-    next: int = 0
-    lost: tuple[str, ...] = ()
+    lines: Annotated[tuple[LogLine, ...], Meta(max_length=limits.LOG_LINES_ASKED)] = ()
+    next: Annotated[int, Meta(ge=0, lt=2**53)] = 0
+    lost: Annotated[tuple[str, ...], Meta(max_length=limits.LOG_LINES_ASKED)] = ()
     error: float | None = None
-    problem: str = ""
-    code: str = ""
 
 
 class LogQuery(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -195,7 +176,7 @@ class LogRing:
 
     def find(
         self, query: LogQuery, now_ns: int, may: Callable[[str], bool] = lambda _: True, yielder: Yielder = iter
-    ) -> LogLines:
+    ) -> ModuleLog:
         """The newest lines that a query asks for.
 
         Args:
@@ -226,7 +207,7 @@ class LogRing:
         if after:
             lost.update(node for _, node in found[len(told) :])
         lines = tuple(_told(line, node) for line, node in reversed(told))
-        return LogLines(lines, self._number, tuple(sorted(lost)[: limits.LOG_LINES_ASKED]))
+        return ModuleLog(lines=lines, next=self._number, lost=tuple(sorted(lost)[: limits.LOG_LINES_ASKED]))
 
     @property
     def nodes(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 from typing import TYPE_CHECKING, Any, Final
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.rpc import PeerRpc
     from rmpa.bridge.services.part import Services
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
@@ -112,9 +112,9 @@ class Nodes(Part):
         rpc = bridge.rpc
         rpc.on_notification(NODES, self._told_by_peer, Needs((), "names of the peer's own nodes"))
         rpc.on_request(LIST, self._list, _VISIBLE)
-        rpc.on_request(NODE_INFO, self._info, _VISIBLE)
+        rpc.on_request(NODE_INFO, self.info, _VISIBLE)
         rpc.on_request(PING, self._ping, _VISIBLE)
-        rpc.on_request(TOP, lambda asker, _args: self.top(asker.link.name), _VISIBLE)
+        rpc.on_request(TOP, self.top, _VISIBLE)
         rpc.on_request(KILL, self._kill, Needs((Access.KILL,), "the node"))
 
     async def close(self) -> None:
@@ -166,8 +166,7 @@ class Nodes(Part):
         ]
         most = self._bridge.context.settings.limits.nodes
         for session in self._bridge.sessions.linked():
-            peer = session.link.name
-            visible = self._visible(peer)
+            peer, visible = session.link.name, self._visible(session)
             names = tuple(sorted(one for one in nodes if one in visible and self._passes(peer, one))[:most])
             if names != self._told.get(session.peer):  # over a new link also that there are none any more
                 self._told[session.peer] = names
@@ -209,15 +208,15 @@ class Nodes(Part):
 
     def _list(self, asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         problems = {node: found.problem for node, found in self._core.unreachable().items()}
-        found = list_nodes(*self._tables(asker.link.name), self._core.state().nodes, problems, yielding_to_data)
+        found = list_nodes(*self._tables(asker), self._core.state().nodes, problems, yielding_to_data)
         return tuple(line for line in found if not is_own(line.name))
 
-    def _tables(self, peer: str = "") -> tuple[_Table, _Table, _Table]:
-        """The nodes by published topic, by subscribed topic and by service: by those that a peer may have."""
-        state, gate = self._core.state(), self._bridge.context.gate
+    def _tables(self, asker: PeerSession | None) -> tuple[_Table, _Table, _Table]:
+        """The nodes by published topic, by subscribed topic and by service: by those that the asker may have."""
+        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
 
         def permitted(access: Access, table: _Table) -> _Table:
-            if not peer or not gate.on:
+            if not gate.on:
                 return table
             rows = yielding_to_data(list(table.items()))
             return {name: nodes for name, nodes in rows if gate.judge(access, peer, name).allowed}
@@ -228,35 +227,28 @@ class Nodes(Part):
             permitted(Access.CALL, state.services),
         )
 
-    def _visible(self, peer: str) -> Collection[str]:
-        """The nodes that a peer is told of: those of which it may have something."""
-        if not self._bridge.context.gate.on:
+    def _visible(self, asker: PeerSession | None) -> Collection[str]:
+        """The nodes that the asker is told of: those of which it may have something."""
+        if not self._bridge.context.gate_for(asker)[0].on:
             return self._core.state().nodes
-        return {node for table in self._tables(peer) for nodes in yielding_to_data(table.values()) for node in nodes}
+        return {node for table in self._tables(asker) for nodes in yielding_to_data(table.values()) for node in nodes}
 
-    async def _info(self, asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
-        return await self.info(args, asker.link.name)
-
-    async def info(self, args: Mapping[str, object], peer: str = "") -> NodeFacts:
-        """The facts about the ``node`` of this module that a request names.
-
-        Args:
-            args: The request's.
-            peer: A peer that asks, which is not told the names of what it may not have; empty: this module.
+    async def info(self, asker: PeerSession | None, args: Mapping[str, object]) -> NodeFacts:
+        """The facts about the ``node`` of this module that a request names, as far as its asker may know them.
 
         Raises:
             RmpaError: There is no such node.
         """
-        node, uri = own_node(self._bridge, args, self._visible(peer) if peer else None)
-        state, gate = self._core.state(), self._bridge.context.gate
-        facts = describe_node(node, uri, *self._tables(peer), state.types)
+        node, uri = own_node(self._bridge, args, self._visible(asker))
+        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
+        facts = describe_node(node, uri, *self._tables(asker), state.types)
         try:
             answer = await ping_node(node, uri, OWN_NODE)
         except RmpaError as error:
             return msgspec.structs.replace(facts, problem=str(error))
         names = {address: name for name, address in state.nodes.items()}
         connections = await node_connections(uri, OWN_NODE, names)
-        if peer and connections is not None:
+        if connections is not None:
             connections = tuple(
                 one
                 for one in connections
@@ -264,64 +256,52 @@ class Nodes(Part):
             )
         return msgspec.structs.replace(facts, pid=answer.pid, connections=connections)
 
-    async def top(self, peer: str = "") -> tuple[NodeCost, ...]:
-        """What the processes of this module's nodes cost; nodes of other machines have none here.
-
-        Args:
-            peer: A peer that asks, which is told only of what it may have; empty: this module.
-        """
-        known, launch = self._core.state().nodes, self._bridge.launch
-        names = self._visible(peer) if peer else known
-        asked = [(name, known[name]) for name in sorted(names) if name in known and not is_own(name)]
+    async def top(self, asker: PeerSession | None, _args: Mapping[str, object]) -> tuple[NodeCost, ...]:
+        """What the processes of this module's nodes cost, of those that the asker may know of and that run here."""
+        state, launch = self._core.state(), self._bridge.launch
+        asked = [name for name in sorted(self._visible(asker)) if name in state.nodes and not is_own(name)]
         turns, starters = asyncio.Semaphore(limits.TOP_AT_ONCE), await launch.starters()
+        here = {
+            *local_addresses(),
+            socket.gethostname(),
+        }  # the names under which nodes of this machine are registered
 
-        async def pid(name: str, uri: str) -> int | None:
+        async def process(name: str) -> int | None:
+            uri = state.nodes[name]
+            if not is_loopback(host_of(uri)) and host_of(uri) not in here:
+                return None
             async with turns:
-                try:
+                with contextlib.suppress(RmpaError, TimeoutError):
                     async with asyncio.timeout(limits.TOP_ANSWER):
                         return (await ping_node(name, uri, OWN_NODE)).pid
-                except (RmpaError, TimeoutError):
-                    return None
+            return None
 
-        here = [is_loopback(host_of(uri)) or host_of(uri) in self._hosts() for _, uri in asked]
-        pids = await asyncio.gather(*(pid(*one) for one in asked))
-        pids = [each if local else None for each, local in zip(pids, here, strict=True)]
-        running = {each for each in pids if each is not None}
+        pids = dict(zip(asked, await asyncio.gather(*map(process, asked)), strict=True))
+        running = {pid for pid in pids.values() if pid is not None}
         launch.shares.keep(running)
         if not all(map(launch.shares.known, running)):
-            for each in running:
-                if (about := figures(each)) is not None:
-                    launch.shares.of(each, about)
+            for pid in running:
+                if (about := figures(pid)) is not None:
+                    launch.shares.of(pid, about)
             await asyncio.sleep(limits.TOP_FIRST)
-        return tuple(
-            self._cost(name, each, starters.get(name, "")) for (name, _), each in zip(asked, pids, strict=True)
-        )
-
-    def _hosts(self) -> list[str]:
-        """The names under which nodes of this machine are registered."""
-        return [*local_addresses(), socket.gethostname()]
+        return tuple(self._cost(name, pid, starters.get(name, "")) for name, pid in pids.items())
 
     def _cost(self, node: str, pid: int | None, started_by: str) -> NodeCost:
         about = figures(pid) if pid is not None else None
         if pid is None or about is None:
             return NodeCost(node=node, started_by=started_by)
+        cpu, since = self._bridge.launch.shares.of(pid, about), about.since
         return NodeCost(
-            node=node,
-            pid=pid,
-            cpu=self._bridge.launch.shares.of(pid, about),
-            rss=about.rss,
-            threads=about.threads,
-            since=about.since,
-            started_by=started_by,
+            node=node, pid=pid, cpu=cpu, rss=about.rss, threads=about.threads, since=since, started_by=started_by
         )
 
     async def _ping(self, asker: PeerSession, args: dict[str, Any]) -> NodePing:
-        node, uri = own_node(self._bridge, args, self._visible(asker.link.name))
+        node, uri = own_node(self._bridge, args, self._visible(asker))
         return await ping_node(node, uri, OWN_NODE)
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> dict[str, bool]:
         peer = asker.link.name
-        node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, peer, args))
+        node, uri = own_node(self._bridge, args, permitted_nodes(self._bridge, Access.KILL, asker, args))
         who = f"{peer}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
         if not matches_any(self._bridge.context.settings.nodes.kill, node):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits [not-permitted]", who, node)
@@ -335,47 +315,45 @@ class Nodes(Part):
         return {"gone": gone}
 
 
-def permitted_nodes(bridge: Bridge, access: Access, peer: str, args: Mapping[str, object]) -> list[str]:
-    """The nodes of this module with which a peer may do something.
+def permitted_nodes(
+    bridge: Bridge, access: Access, asker: PeerSession | None, args: Mapping[str, object]
+) -> list[str]:
+    """The nodes of this module with which an asker may do something.
 
     Raises:
         RmpaError: It may not with the ``node`` of its request, whether there is one or not.
     """
-    gate, named = bridge.context.gate, str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+    (gate, peer), named = bridge.context.gate_for(asker), str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
     if why := gate.why_not(access, peer, named):
         raise RmpaError(why, code="not-permitted")
     return [node for node in bridge.core.state().nodes if gate.judge(access, peer, node).allowed]
 
 
 def own_node(
-    bridge: Bridge, args: Mapping[str, object], told: Collection[str] | None, *, agents: bool = False
+    bridge: Bridge, args: Mapping[str, object], told: Collection[str], *, agents: bool = False
 ) -> tuple[str, str]:
     """The node of this module that a request names, and its slave API.
 
     Args:
         bridge: Its core.
         args: The request's.
-        told: The nodes that may be told of; ``None``: all.
+        told: The nodes that may be told of.
         agents: Whether the agent's own node counts.
 
     Raises:
         RmpaError: There is no such node.
     """
-    here = bridge.context.settings.name
-    node = args.get("node")
+    here, node, nodes = bridge.context.settings.name, args.get("node"), bridge.core.state().nodes
     if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
         raise RmpaError("the question names no node")
     if is_own(node) and not (agents and node == OWN_NODE):
         origin = proxied_node(node)
         whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
         raise RmpaError(f"{node} is no node of {here}: {whose}", code="unknown-name")
-    nodes = bridge.core.state().nodes
-    known = nodes if told is None else told
-    if node not in known or node not in nodes:
-        near = did_you_mean(node, [name for name in known if not is_own(name)])
-        raise RmpaError(
-            f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""), code="unknown-name"
-        )
+    if node not in told or node not in nodes:
+        near = did_you_mean(node, [name for name in told if not is_own(name)])
+        hint = f"; did you mean {near}?" if near else ""
+        raise RmpaError(f"{here} has no node {node}{hint}", code="unknown-name")
     return node, nodes[node]
 
 
@@ -395,14 +373,14 @@ class ProxyKills:
     before the proxies. It ends only the nodes of this module; nodes of other modules live on.
 
     Args:
-        rpc: Sends the requests.
+        bridge: The peers.
 
     Attributes:
         _all: By caller of ``kill -a``: until when its further calls are taken for a part of that.
     """
 
-    def __init__(self, rpc: PeerRpc) -> None:
-        self._rpc = rpc
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
         self._all: dict[str, float] = {}
         self._under_way = 0
 
@@ -415,15 +393,20 @@ class ProxyKills:
         _log.info("= %s asks the agent's own node to end (%s): it stays, end the agent instead", caller, reason)
         return RosReply(_REFUSED, "this node is the agent; it ends with `rmpa up`", 0)
 
-    async def proxy(self, session: PeerSession, node: str, caller: str, reason: str) -> RosReply:
+    async def proxy(self, proxy: str, caller: str, reason: str) -> RosReply:
         """End the node that a proxy stands for, because the proxy was asked to end.
 
         Args:
-            session: The peer that has the node.
-            node: The node's name in the peer's graph.
+            proxy: The proxy's name.
             caller: The caller's node.
             reason: The caller's reason, as text.
         """
+        linked = self._bridge.sessions.linked()
+        session = next((one for one in linked if proxy.startswith(f"{one.proxies.prefix}/")), None)
+        if session is None:
+            module, node = proxied_node(proxy) or ("", proxy)
+            return RosReply(_REFUSED, f"{node} is a node of {module}, to which there is no link: ask there", 0)
+        node = proxy.removeprefix(session.proxies.prefix)
         whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:
             # Another local node took the proxy's name. That does not concern the node at the peer.
@@ -442,14 +425,12 @@ class ProxyKills:
         if self._all.get(caller, 0.0) > now:
             self._all[caller] = now + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
-        if not session.linked:
-            return f"{session.link.name} is not linked"
         if self._under_way >= limits.NODE_KILLS_AT_ONCE:
             return f"{self._under_way} other nodes are being ended; try again"
         self._under_way += 1
         try:
             args = {"node": node, "by": caller, "reason": reason[: limits.ASK_NAME_MAX]}
-            answer = await self._rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
+            answer = await self._bridge.rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
         except RmpaError as error:
             return str(error)
         finally:

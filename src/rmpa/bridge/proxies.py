@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
 
@@ -14,7 +15,6 @@ from rmpa.ros.environment import is_loopback
 from rmpa.ros.node.listeners import SharedListener
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
-from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.accept import DESCRIPTORS, Use, is_shortage, open_files_advice
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.runtime.tasks import start_task
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rmpa.core.statistics import Counters
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
+    from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
 
@@ -96,15 +97,22 @@ class ProxyNodes:
     Args:
         core: The local core.
         counters: Where refusals at the proxies' ports are counted.
+        on_kill: ``(proxy, caller id, reason) -> reply``: called when a proxy is asked to end (``rosnode kill``).
 
     Attributes:
         _made: The last node of each name.
         listening: How the proxies listen, as text: at which ports, or why each has two sockets of its own.
     """
 
-    def __init__(self, core: Core, counters: Counters | None = None) -> None:
+    def __init__(
+        self,
+        core: Core,
+        counters: Counters | None = None,
+        on_kill: Callable[[str, str, str], Awaitable[RosReply]] | None = None,
+    ) -> None:
         self._core = core
         self._counters = counters
+        self._on_kill = on_kill
         self._listener: SharedListener | None = None
         self._made: WeakValueDictionary[str, SlaveNode] = WeakValueDictionary()
         self.listening = ""
@@ -136,12 +144,8 @@ class ProxyNodes:
             await self._listener.close()
             self._listener = None
 
-    def make(self, name: str, on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None) -> SlaveNode:
-        """Make a proxy, which is not started.
-
-        Args:
-            name: Its name in the local graph.
-            on_kill: ``(caller id, reason) -> reply``: called when it is asked to end (``rosnode kill``).
+    def make(self, name: str) -> SlaveNode:
+        """Make a proxy of this name, which is not started.
 
         Raises:
             OSError: It would have sockets of its own, and too few file descriptors are left (``EMFILE``).
@@ -156,7 +160,7 @@ class ProxyNodes:
             advertised_host=self._core.node_address,
             listener=self._listener,
             counters=self._counters,
-            on_kill=on_kill,
+            on_kill=partial(self._on_kill, name) if self._on_kill is not None else None,
             elsewhere=lambda topic: self._elsewhere(name, topic),
         )
         return node
@@ -183,10 +187,6 @@ class ProxyNodes:
 User = tuple[Callable[[SlaveNode], None], Callable[[SlaveNode], None]]
 
 
-async def _refuse_to_end(node: str, _caller: str, _reason: str) -> RosReply:
-    return RosReply(0, f"{node} is a node of another module", 0)
-
-
 class PeerProxies:
     """The proxies of one module; each exists while a topic or service holds it.
 
@@ -199,7 +199,6 @@ class PeerProxies:
     Args:
         prefix: The namespace of this module's proxies.
         nodes: Makes the proxies.
-        on_kill: ``(node, caller id, reason) -> reply``: called when the proxy of this module's node is asked to end.
 
     Attributes:
         _wanted: By the module's node: the topics and services that hold its proxy, by key.
@@ -210,15 +209,9 @@ class PeerProxies:
         _task: Carries out the changes; ``None`` while there are none.
     """
 
-    def __init__(
-        self,
-        prefix: str,
-        nodes: ProxyNodes,
-        on_kill: Callable[[str, str, str], Awaitable[RosReply]] = _refuse_to_end,
-    ) -> None:
+    def __init__(self, prefix: str, nodes: ProxyNodes) -> None:
         self.prefix = prefix
         self._nodes = nodes
-        self._on_kill = on_kill
         self._wanted: dict[str, dict[Hashable, User]] = {}
         self._held: dict[str, dict[Hashable, User]] = {}
         self._proxies: dict[str, SlaveNode] = {}
@@ -312,7 +305,7 @@ class PeerProxies:
         if proxy is None:
             if node not in self._wanted:
                 return
-            proxy = self._nodes.make(self.name(node), lambda caller, reason: self._on_kill(node, caller, reason))
+            proxy = self._nodes.make(self.name(node))
             await proxy.start()  # meanwhile less may be wanted: a released topic may have another type elsewhere
             self.problems.pop(node, None)
             self._proxies[node], self._held[node] = proxy, {}

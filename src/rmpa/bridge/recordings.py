@@ -21,12 +21,12 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import why_unanswered
+from rmpa.bridge.rpc import meant
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.identity import is_meant
+from rmpa.core.facts import ModuleAnswer
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -44,25 +44,18 @@ REMOVE: Final = "record.remove"
 _SECOND: Final = 1_000_000_000
 # For permissions: stands for all recordings, where a peer asks what the recorder does.
 _ANY: Final = "/*"
-_EARLIER: Final = "its agent is of an earlier release, which has no recordings; install this release there"
 
 
-class ModuleRecordings(msgspec.Struct, frozen=True, kw_only=True):
+class ModuleRecordings(ModuleAnswer, frozen=True, kw_only=True):
     """The recordings of one module.
 
     Attributes:
-        module: Its name.
         kept: What it has kept, oldest first.
         status: What its recorder does (``record.recorder.RecorderStatus``); empty: none runs.
-        problem: Why it does not tell.
-        code: Of that, by ``core.codes``.
     """
 
-    module: str
     kept: tuple[Kept, ...] = ()
-    status: dict[str, Any] = {}
-    problem: str = ""
-    code: str = ""
+    status: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class FilePart(msgspec.Struct, frozen=True):
@@ -161,7 +154,7 @@ class Recordings(Part):
             why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept), "now": now})
         except PeerRefused as error:
             done.add(session.link.name)
-            return _EARLIER if error.unknown else error.reason
+            return error.reason
         except RmpaError as error:
             return str(error)
         done.add(session.link.name)
@@ -178,20 +171,22 @@ class Recordings(Part):
         )
         return await self._keep_here(moved)
 
-    def _check(self, asker: PeerSession, name: object) -> str:
-        kept = check_id(str(name))
-        if why := self._bridge.context.gate.why_not(Access.RECORD, asker.link.name, f"/{kept}"):
+    def _check(self, asker: PeerSession | None, name: object) -> str:
+        kept, (gate, peer) = check_id(str(name)), self._bridge.context.gate_for(asker)
+        if why := gate.why_not(Access.RECORD, peer, f"/{kept}"):
             raise RmpaError(why, code="not-permitted")
         return kept
 
-    async def _list(self, asker: PeerSession, _args: dict[str, Any]) -> ModuleRecordings:
-        gate, peer = self._bridge.context.gate, asker.link.name
+    async def _list(self, asker: PeerSession | None, _args: Mapping[str, Any]) -> ModuleRecordings:
+        gate, peer = self._bridge.context.gate_for(asker)
         found = await asyncio.to_thread(self._here)
         kept = tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
         why = gate.why_not(Access.RECORD, peer, _ANY)  # it names the topics
         if why and not kept:
             raise RmpaError(why, code="not-permitted")
-        return msgspec.structs.replace(found, kept=kept, **({"status": {}, "problem": "", "code": ""} if why else {}))
+        if why:
+            return ModuleRecordings(module=found.module, kept=kept)
+        return msgspec.structs.replace(found, kept=kept)
 
     def _here(self) -> ModuleRecordings:
         folder = self.folder
@@ -210,20 +205,12 @@ class Recordings(Part):
 
     async def list(self) -> list[ModuleRecordings]:
         """The recordings of this module and of its peers."""
-        peers = [*self._bridge.sessions.linked()]
-        own = await asyncio.to_thread(self._here)
-        return [own, *await asyncio.gather(*map(self._list_of, peers))]
+        rpc, peers = self._bridge.rpc, [*self._bridge.sessions.linked()]
+        own = await self._list(None, {})
+        return [own, *await asyncio.gather(*(rpc.ask(peer, LIST, {}, ModuleRecordings) for peer in peers))]
 
-    async def _list_of(self, session: PeerSession) -> ModuleRecordings:
-        try:
-            found = msgspec.convert(await self._bridge.rpc.request(session, LIST, {}), ModuleRecordings)
-            return msgspec.structs.replace(found, module=session.link.name)
-        except (RmpaError, msgspec.ValidationError) as error:
-            problem, code = why_unanswered(error, _EARLIER)
-        return ModuleRecordings(module=session.link.name, problem=problem, code=code)
-
-    async def _read(self, asker: PeerSession, args: dict[str, Any]) -> FilePart:
-        return await asyncio.to_thread(self._part, self._check(asker, args.get("id")), args)
+    async def _read(self, asker: PeerSession | None, args: Mapping[str, Any]) -> FilePart:
+        return await asyncio.to_thread(self._part, self._check(asker, args.get("id", "")), args)
 
     def _part(self, name: str, args: Mapping[str, Any]) -> FilePart:
         """A part of a file of a recording of this module.
@@ -255,8 +242,8 @@ class Recordings(Part):
             raise RmpaError("there is no state directory; set RMPA_STATE_DIR", code="no-state-directory")
         return folder / KEPT
 
-    async def _remove(self, asker: PeerSession, args: dict[str, Any]) -> Kept:
-        return await asyncio.to_thread(remove_kept, self._kept(), self._check(asker, args.get("id")))
+    async def _remove(self, asker: PeerSession | None, args: Mapping[str, Any]) -> Kept:
+        return await asyncio.to_thread(remove_kept, self._kept(), self._check(asker, args.get("id", "")))
 
     async def answer(self, args: Mapping[str, Any]) -> Any:
         """What a command asks: ``what`` is keep, list, read or remove, of the ``module`` (without one: this one).
@@ -265,22 +252,18 @@ class Recordings(Part):
             RmpaError: It cannot be done.
         """
         what, module = str(args.get("what", "list")), str(args.get("module", ""))
-        own = self._bridge.context.settings.name
         if what == "list":
             return await self.list()
         if what == "keep":
             only = args.get("modules", ())
             return await self.keep(self._made(args), [str(each) for each in only] if isinstance(only, list) else ())
-        request = {"read": READ, "remove": REMOVE}.get(what)
-        if request is None:
+        if what not in ("read", "remove"):
             raise RmpaError(f"{what!r} is no question about recordings", code="unknown-name")
-        if module in ("", own):
-            if request == REMOVE:
-                return await asyncio.to_thread(remove_kept, self._kept(), str(args.get("id", "")))
-            return await asyncio.to_thread(self._part, check_id(str(args.get("id", ""))), args)
-        sessions = [s for s in self._bridge.sessions.linked() if is_meant(module, s.link.name, str(s.link.guid))]
-        if not sessions:
+        if module in ("", self._bridge.context.settings.name):
+            return await (self._read if what == "read" else self._remove)(None, args)
+        if not (sessions := meant(self._bridge.sessions.linked(), module)):
             raise RmpaError(f"{module} is not linked; `rmpa peer list` shows why", code="peer-unlinked")
+        request = READ if what == "read" else REMOVE
         inner = {key: args[key] for key in ("id", "file", "offset", "size", "check") if key in args}
         return await self._bridge.rpc.request(sessions[0], request, inner, limits.RECORDING_TIMEOUT)
 

@@ -17,7 +17,7 @@ import itertools
 import logging
 import time
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -25,6 +25,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Notification, Request, Response, decode, encode, with_text, without_text
 from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.sessions import Part
+from rmpa.config.values import suggestion
 from rmpa.core.errors import (
     UNKNOWN_QUESTION,
     LimitExceeded,
@@ -33,10 +34,14 @@ from rmpa.core.errors import (
     RmpaError,
     UnreachableError,
 )
+from rmpa.core.facts import ModuleAnswer
+from rmpa.core.identity import is_meant
 from rmpa.core.limits import UINT32_MAX
 from rmpa.runtime.tasks import OwnedTasks, end_tasks
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rmpa.bridge.messages import Message
     from rmpa.bridge.policy import Needs
     from rmpa.bridge.sessions import PeerSession
@@ -52,18 +57,23 @@ Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
 Listener = Callable[["PeerSession", dict[str, Any]], None]
 
 
-def why_unanswered(error: RmpaError | msgspec.ValidationError, earlier: str) -> tuple[str, str]:
-    """Why a peer has not answered as asked, and the code of that.
+# Of an agent that does not know a question that a later release asks.
+_EARLIER: Final = "its agent is of an earlier release, which does not know this; install this release there"
 
-    Args:
-        error: That of the request, or of ``msgspec.convert`` on its answer.
-        earlier: The text for an agent of an earlier release, which does not know the question.
-    """
-    if isinstance(error, msgspec.ValidationError):
-        return f"its answer is malformed: {error}", "protocol-error"
-    if not isinstance(error, PeerRefused):
-        return str(error), error.code
-    return (earlier, "other-release") if error.unknown else (error.reason, "not-permitted")
+
+_Answer = TypeVar("_Answer", bound=ModuleAnswer)
+
+
+def meant(sessions: Iterable[PeerSession], module: object) -> list[PeerSession]:
+    """The peers among these that a user means by a name or a GUID."""
+    return [one for one in sessions if is_meant(str(module), one.link.name, str(one.link.guid))]
+
+
+def no_such_module(module: str, own: str, sessions: Iterable[PeerSession]) -> RmpaError:
+    """The error about a name that no linked module has; the nearest one is named."""
+    names = [own, *(one.link.name for one in sessions)]
+    near = suggestion(module, names, "`rmpa peer list` shows which modules are there")
+    return RmpaError(f"no linked module has this name; {near}", code="unknown-name")
 
 
 class PeerRpc(Part):
@@ -109,6 +119,26 @@ class PeerRpc(Part):
         if link is None:
             raise UnreachableError("agent", session.link.name, _LINK_ENDED)
         return await link.request(what, args, timeout)
+
+    async def ask(
+        self,
+        session: PeerSession,
+        what: str,
+        args: dict[str, Any],
+        answer: type[_Answer],
+        timeout: float = limits.ASK_TIMEOUT,  # noqa: ASYNC109 - as of ``request``
+    ) -> _Answer:
+        """Send a request to a peer as ``request`` does, and return its answer, or one that says why there is none."""
+        try:
+            value = await self.request(session, what, args, timeout)
+            return msgspec.structs.replace(msgspec.convert(value, answer), module=session.link.name)
+        except msgspec.ValidationError as error:
+            problem, code = f"its answer is malformed: {error}", "protocol-error"
+        except PeerRefused as error:
+            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
+        except RmpaError as error:
+            problem, code = str(error), error.code
+        return answer(module=session.link.name, problem=problem, code=code)
 
     def link_up(self, session: PeerSession) -> None:
         """Take the large messages of a linked peer."""

@@ -15,12 +15,11 @@ from rmpa.bridge.policy import OPEN_GATE, PermissionGate
 from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
 from rmpa.core.log import logged_failure
 from rmpa.mesh import limits as mesh_limits
-from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import yield_to_data
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from contextlib import AbstractContextManager
 
     from rmpa.bridge.messages import Message, Origin
@@ -182,7 +181,6 @@ class PeerSessions:
     Args:
         parts: The parts, notified in this order; more may be added until the first link is up.
         nodes: Makes the proxies.
-        on_kill: ``(session, node, caller id, reason) -> reply``: called when a node's proxy is asked to end.
         gate: Whether the mesh is secured.
     """
 
@@ -190,13 +188,11 @@ class PeerSessions:
         self,
         parts: Sequence[Part],
         nodes: ProxyNodes,
-        on_kill: Callable[[PeerSession, str, str, str], Awaitable[RosReply]],
         gate: PermissionGate = OPEN_GATE,
     ) -> None:
         self._gate = gate
         self._parts = parts
         self._nodes = nodes
-        self._on_kill = on_kill
         self._numbers = itertools.count(1)
         self._by_number: dict[int, PeerSession] = {}
         self._by_link: dict[PeerLink, PeerSession] = {}
@@ -247,16 +243,9 @@ class PeerSessions:
         return self._namespaces.relayed_name(origin, reserve=True)
 
     def _proxies_of(self, instance: str, name: str, prefix: str) -> PeerProxies:
-        async def kill(node: str, caller: str, reason: str) -> RosReply:
-            for session in self.linked():
-                if session.proxies is proxies:
-                    return await self._on_kill(session, node, caller, reason)
-            return RosReply(0, f"{node} is a node of {name}, to which there is no link: ask there", 0)
-
-        if (found := self._modules.get((instance, name))) is not None:
-            return found
-        proxies = self._modules[instance, name] = PeerProxies(prefix, self._nodes, kill)
-        return proxies
+        if (instance, name) not in self._modules:
+            self._modules[instance, name] = PeerProxies(prefix, self._nodes)
+        return self._modules[instance, name]
 
     def link_up(self, link: PeerLink) -> None:
         """Attach a link to the session that waits for it, or begin a session.

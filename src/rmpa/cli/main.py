@@ -554,11 +554,6 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         done = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
-        if isinstance(error, click.NoSuchOption):
-            from rmpa.config.schema import REMOVED
-
-            if remedy := REMOVED.get(error.option_name):
-                error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
         text, code, status = error.format_message(), "usage", error.exit_code
         if isinstance(error, click.exceptions.NoArgsIsHelpError):
             click.echo(text, err=True)

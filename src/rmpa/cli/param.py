@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import click
 import yaml
 
-from rmpa.bridge.params.transfer import key_problem
+from rmpa.bridge.params.owner import key_problem
 from rmpa.cli.completion import completes, peers
 from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb

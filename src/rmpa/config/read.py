@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from ipaddress import AddressValueError, IPv4Address
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from rmpa.config.module_name import NAME_FILE, NameSource, choose_name, kept_name, state_dir
 from rmpa.config.peer_rules import peer_warnings, permission_problems
 from rmpa.config.rules import contract_warnings
-from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS, Settings, json_schema
-from rmpa.config.toml_file import dotted, line_of, read_toml, value_at
+from rmpa.config.toml_file import check_writers, dotted, line_of, read_toml, value_at
 from rmpa.config.values import BadValue, did_you_mean, suggestion
-from rmpa.config.writers import check_writers
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
 
     from rmpa.config.schema import Key, Setting
     from rmpa.config.values import Place
@@ -100,7 +98,6 @@ class Given:
 
 # The raw values of one source, by the setting's name.
 _Layer = dict[str, Given]
-_Table = TypeVar("_Table")
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +174,7 @@ def load_settings(
         strongest["name"] = Given(_BY_NAME["name"], names[NameSource.KEPT], str(directory / NAME_FILE))
     settings = Settings(config_file=path)
     for name, value in values.items():
-        settings = _with(settings, name.split("."), value)
+        settings = _BY_NAME[name].put(settings, value)
     for name, warnings in (
         ("contracts", contract_warnings(settings.contracts)),
         ("peers", peer_warnings(settings.peers)),
@@ -203,13 +200,6 @@ def _insecure(settings: Settings, strongest: _Layer, from_file: _Layer) -> Itera
 def _name_in(layer: _Layer) -> str:
     """The module's name as one source says it; empty: it does not."""
     return str(layer["name"].read()) if "name" in layer else ""
-
-
-def _with(table: _Table, path: Sequence[str], value: object) -> _Table:
-    """A dataclass of settings with one other value, at a path of attributes."""
-    name, *rest = path
-    inner = _with(getattr(table, name), rest, value) if rest else value
-    return replace(table, **{name: inner})  # type: ignore[type-var] # each is a dataclass of settings
 
 
 def _check_together(settings: Settings, given: _Layer) -> None:
@@ -299,8 +289,6 @@ def _file_layer(path: Path, environ: Mapping[str, str]) -> _Layer:
 
 def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
     for variable in sorted(environ):
-        if variable in REMOVED:
-            raise ConfigError(variable, "is not a variable any more", REMOVED[variable], code="removed")
         if variable.startswith("RMPA_") and variable not in VARIABLES:
             near = did_you_mean(variable, VARIABLES)
             notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))

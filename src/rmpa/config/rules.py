@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
 from rmpa.config.peer_rules import TRANSPORT
-from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting, table
+from rmpa.config.schema import NEEDED, Setting, keys_of, rules_of, setting, switch, table
 from rmpa.config.values import (
-    BOOL,
     BYTES_A_SECOND,
     DOMAIN,
     NAME,
@@ -380,7 +379,7 @@ GATEWAY_RULES: Final = rules_of(
 class Ros2Settings:
     """The table ``[gateway.ros2]``."""
 
-    enabled: bool = setting(False, BOOL, "Join a ROS 2 graph.", option="--ros2/--no-ros2")
+    enabled: bool = switch("Join a ROS 2 graph.", option="--ros2/--no-ros2")
     domain: int = setting(0, DOMAIN, "ROS_DOMAIN_ID there; by rclpy 0 is the environment's.", option="--ros2-domain")
     distribution: str = setting(
         "jazzy",
@@ -442,12 +441,10 @@ class GatewaySettings:
     listen: tuple[str, ...] = setting(
         (), list_of(ENDPOINT), "Zenoh endpoints to listen at, such as tls/0.0.0.0:7447.", option="--listen"
     )
-    router: bool = setting(
-        False, BOOL, "Be a Zenoh router, which the gateways of other sites connect to.", option="--router/--no-router"
+    router: bool = switch(
+        "Be a Zenoh router, which the gateways of other sites connect to.", option="--router/--no-router"
     )
-    insecure: bool = setting(
-        False,
-        BOOL,
+    insecure: bool = switch(
         "Connect without certificates; else the module must have joined a secured mesh.",
         option="--insecure/--no-insecure",
     )

@@ -15,10 +15,10 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from rmpa.config.values import BadValue, JsonSchema, ValueType, read_at, shown
+from rmpa.config.values import BOOL, BadValue, JsonSchema, ValueType, read_at, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 _T = TypeVar("_T")
 # A key of the file: ``("core", "port")``.
@@ -100,6 +100,17 @@ class Setting:
         """Its value in a ``Settings``."""
         return reduce(getattr, self.path, settings)
 
+    def put(self, settings: _T, value: object) -> _T:
+        """A ``Settings`` that has another value of it."""
+        return _with(settings, self.path, value)
+
+
+def _with(table: _T, path: Sequence[str], value: object) -> _T:
+    """A dataclass of settings with one other value, at a path of attributes."""
+    name, *rest = path
+    inner = _with(getattr(table, name), rest, value) if rest else value
+    return replace(table, **{name: inner})  # type: ignore[type-var] # each is a dataclass of settings
+
 
 def setting(
     default: _T,
@@ -128,6 +139,18 @@ def setting(
     it = Setting(value_type, help, default, (), env, option, shown_default, live)
     made: _T = field(default=default, metadata={"setting": it, "key": key})
     return made
+
+
+def switch(
+    help: str,  # noqa: A002 - as of ``setting``
+    *,
+    default: bool = False,
+    key: str | None = None,
+    option: str = "",
+    live: bool = False,
+) -> bool:
+    """Declare a setting that is true or false; the arguments are those of ``setting``."""
+    return setting(default, BOOL, help, key=key, option=option, live=live)
 
 
 def table(kind: type[_T], name: str, env: str = "", *, live: bool = False, command: str = "up") -> _T:
@@ -219,27 +242,3 @@ def rules_of(
         "properties": {name: key.type.json_schema | {"description": key.help} for name, key in keys.items()},
     }
     return ValueType(read, {"type": "array", "items": schema | ({"required": needed} if needed else {})})
-
-
-_REMEDIES: Final = {
-    "peer.remap": 'write remap_in = { "FROM" = "TO" } for direction = "in", remap_out = { "FROM" = "TO" } for "out"; '
-    "it holds for topics of all types",
-    "web_token": "use the one token; control and drive of [web] say what clients may do with it",
-    "core.fresh": 'write keep = "never" in place of true',
-    "RMPA_FRESH": "set RMPA_KEEP=never in its place",
-    "--fresh": "write --keep never",
-    "--known": "rosbag record /SONAR/descriptor keeps what a resource was",
-    "realtime.cpus RMPA_REALTIME_CPUS": "write CPUAffinity= into the systemd unit, or start it by `taskset -c`",
-    "realtime.keep_awake RMPA_REALTIME_KEEP_AWAKE": "keep the CPUs awake by the system: "
-    "tuned's profile latency-performance, or processor.max_cstate=1",
-    "gateway.ros1_bridge gateway.ros1_bridge_namespace RMPA_GATEWAY_ROS1_BRIDGE RMPA_GATEWAY_ROS1_BRIDGE_NAMESPACE "
-    "--ros1-bridge --no-ros1-bridge": "let a gateway with a site name join those robots, "
-    "or run zenoh-bridge-ros1 beside rmpa",
-    "mesh.links mesh.full_mesh_up_to RMPA_LINKS RMPA_FULL_MESH_UP_TO": "leave it out: "
-    "up to 256 modules keep a link to each other; make more of them sites (docs/guides/sites.md)",
-    "gateway.store RMPA_GATEWAY_STORE gateway.rule.keep": "no gateway keeps values: "
-    "record the topic with rosbag, or keep its key by a storage of Zenoh",
-    "--yes": "leave it out: nothing is asked",
-}
-# What to use in place of a key, variable or option that is gone.
-REMOVED: Final = {name: remedy for names, remedy in _REMEDIES.items() for name in names.split()}

@@ -13,22 +13,16 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits, peer_rules
-from rmpa.config.recording import RecordSettings
 from rmpa.config.rules import CONTRACT_RULES, PARAM_RULES, FollowRule, GatewaySettings
-from rmpa.config.schema import setting, settings_of, table
+from rmpa.config.schema import setting, settings_of, switch, table
 from rmpa.config.values import (
-    BOOL,
     BOUND,
-    COMMAND_AGE,
-    CORE_KEEP,
-    CORE_MODE,
+    BYTES_A_SECOND,
     DOMAIN,
     DSCP,
-    FIFO_PRIORITY,
     HOST,
     HOST_PORT,
     INTERFACE,
-    LOG_LEVEL,
     MASTER_URI,
     MULTICAST,
     NAME,
@@ -39,13 +33,18 @@ from rmpa.config.values import (
     PEER,
     PEER_GLOB,
     PORT,
-    PORT_OR_ANY,
+    RATE,
     SERVICE_GLOB,
     TEXT,
     TIMEOUT,
+    TOPIC_GLOB,
+    TYPE_GLOB,
     HostPort,
     Multicast,
+    duration_of,
     list_of,
+    whole_number,
+    word_of,
 )
 from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
 
@@ -65,7 +64,7 @@ class ServiceSettings:
 
     allow: tuple[str, ...] = setting(("/**",), list_of(SERVICE_GLOB), "Services that may cross, by their names here.")
     deny: tuple[str, ...] = setting((), list_of(SERVICE_GLOB), "Services that do not cross.")
-    loggers: bool = setting(False, BOOL, "Whether each node's get_loggers and set_logger_level cross too.")
+    loggers: bool = switch("Whether each node's get_loggers and set_logger_level cross too.")
     timeout: float = setting(
         limits.SERVICE_TIMEOUT,
         TIMEOUT,
@@ -104,10 +103,8 @@ class ResourceSettings:
         "~/.config/rmpa/resources; no other user may write there.",
         shown_default="none: nothing is started",
     )
-    start: bool = setting(True, BOOL, "Start those with boot = true in their table [start].")
-    open: bool = setting(
-        False,
-        BOOL,
+    start: bool = switch("Start those with boot = true in their table [start].", default=True)
+    open: bool = switch(
         "In a mesh that is not secured every program in the network may then start, stop and read what is in the "
         "folder; in a secured mesh a [[permission]] with launch says who may.",
         live=True,
@@ -130,7 +127,7 @@ class TimeSettings:
     """Simulated time (``/use_sim_time`` and ``/clock``) across modules."""
 
     follow: str = setting("", NAME_OR_EMPTY, "The peer whose simulated time is used here; empty: none.")
-    share: bool = setting(False, BOOL, "Whether peers may follow this module's time.")
+    share: bool = switch("Whether peers may follow this module's time.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,20 +164,20 @@ class LaneSettings:
 class RealtimeSettings:
     """Requests to the kernel for real-time behaviour; refusals are logged."""
 
-    enabled: bool = setting(False, BOOL, "Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
+    enabled: bool = switch("Ask for SCHED_FIFO and locked memory.", option="--realtime/--no-realtime")
     priority: int = setting(
-        50, FIFO_PRIORITY, "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first."
+        50,
+        whole_number(1, 99, "a priority of SCHED_FIFO"),
+        "Priority of SCHED_FIFO; below 50 the kernel's interrupt threads come first.",
     )
-    lock_memory: bool = setting(True, BOOL, "Keep the agent's memory in RAM (mlockall).")
+    lock_memory: bool = switch("Keep the agent's memory in RAM (mlockall).", default=True)
 
 
 @dataclass(frozen=True, slots=True)
 class WebSettings:
     """Where ``rmpa web`` serves, and whether the agent starts it."""
 
-    enabled: bool = setting(
-        False, BOOL, "Start rmpa web with the agent, and restart it if it ends.", option="--web/--no-web"
-    )
+    enabled: bool = switch("Start rmpa web with the agent, and restart it if it ends.", option="--web/--no-web")
     port: int = setting(8480, PORT, "The port of rmpa web.")
     listen: str = setting(
         "127.0.0.1", HOST, "The address that rmpa web listens at; beyond this machine clients need a token."
@@ -200,24 +197,69 @@ class WebSettings:
     origins: tuple[str, ...] = setting(
         (), list_of(TEXT), "Pages of other sites that may connect, such as https://app.foxglove.dev.", live=True
     )
-    control: bool = setting(
-        False,
-        BOOL,
-        "Let clients publish, call and offer services, and set parameters; they then need the token.",
-        live=True,
+    control: bool = switch(
+        "Let clients publish, call and offer services, and set parameters; they then need the token.", live=True
     )
     cert: str = setting(
         "", TEXT, "Serve HTTPS with this certificate: a PEM file, the intermediate certificates behind it."
     )
     key: str = setting("", TEXT, "The certificate's private key: a PEM file; empty: it is in the certificate's file.")
-    drive: bool = setting(
-        False, BOOL, "Let the monitor's joystick command a robot; clients then need the token.", live=True
-    )
+    drive: bool = switch("Let the monitor's joystick command a robot; clients then need the token.", live=True)
     command_age_ms: int = setting(
         0,
-        COMMAND_AGE,
+        whole_number(0, 60_000, "milliseconds (0: any age)", "MS"),
         "Drop what rosbridge and Foxglove clients publish, call and set if it may be older than this; 0: take all.",
         live=True,
+    )
+
+
+_MEGABYTES: Final = whole_number(1, 1_000_000, "a number of MB", "MB")
+# What keeps a recording by itself.
+ALARM, PEER_LOST, NODE_DIED, CONTRACT = "alarm", "peer_lost", "node_died", "contract"
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """What ``rmpa record`` keeps of the last minutes, and whether the agent starts it."""
+
+    enabled: bool = switch(
+        "Start rmpa record with the agent, and restart it if it ends.", option="--record/--no-record"
+    )
+    topics: tuple[str, ...] = setting(("/**",), list_of(TOPIC_GLOB), "Topics of this module's nodes to record.")
+    deny: tuple[str, ...] = setting((), list_of(TOPIC_GLOB), "Topics that are not recorded.", shown_default="none")
+    seconds: float | None = setting(120.0, duration_of("a duration"), "How much of the past is there to keep.")
+    megabytes: int = setting(512, _MEGABYTES, "The most that the past takes on the disk, MB.")
+    kept_megabytes: int = setting(
+        4096, _MEGABYTES, "The most that kept recordings take, MB; the oldest that no person asked for give way."
+    )
+    topic_rate: int | None = setting(
+        4_000_000, BYTES_A_SECOND, "The most that one topic may write; what is above it is left out, and counted."
+    )
+    total_rate: int | None = setting(
+        None, BYTES_A_SECOND, "The most that all topics together may write; likewise.", shown_default="unlimited"
+    )
+    thin: float | None = setting(5.0, RATE, "Messages a second of thin_types.")
+    thin_types: tuple[str, ...] = setting(
+        ("sensor_msgs/*Image", "sensor_msgs/PointCloud*"), list_of(TYPE_GLOB), "Types that are thinned."
+    )
+    keep_on: tuple[str, ...] = setting(
+        (ALARM, PEER_LOST, NODE_DIED),
+        list_of(
+            word_of(
+                (ALARM, PEER_LOST, NODE_DIED, CONTRACT), "a reason", "it is alarm, peer_lost, node_died or contract"
+            )
+        ),
+        "What keeps a recording, at all modules that are linked: alarm, peer_lost, node_died, contract.",
+    )
+    stop_topics: tuple[str, ...] = setting(
+        (),
+        list_of(TOPIC_GLOB),
+        "Topics of emergency stops: a message (of std_msgs/Bool: true) keeps a recording.",
+        shown_default="none",
+    )
+    after: float | None = setting(5.0, duration_of("a duration"), "How long a recording goes on behind its reason.")
+    fsync: float | None = setting(
+        1.0, duration_of("a duration"), "How often the disk must have it: what a power cut may take; infinite: never."
     )
 
 
@@ -244,16 +286,12 @@ class TrustSettings:
         "Modules that may pass on what others offer; the origin that they name cannot be proved.",
         live=True,
     )
-    direct: bool = setting(
-        False,
-        BOOL,
+    direct: bool = switch(
         "Let nodes connect directly to those of other machines although nothing protects these connections.",
         live=True,
     )
-    require: bool = setting(False, BOOL, "Refuse to start while this module has not joined a secured mesh.")
-    insecure: bool = setting(
-        False,
-        BOOL,
+    require: bool = switch("Refuse to start while this module has not joined a secured mesh.")
+    insecure: bool = switch(
         "Start without trust although other modules here have keys; a module with its own keys is secured anyway.",
         option="--insecure",
     )
@@ -283,7 +321,12 @@ class Settings:
     domain: int = setting(0, DOMAIN, "Agents join only those of the same domain, 0 to 232.", option="--domain")
     core_mode: str = setting(
         "embedded",
-        CORE_MODE,
+        word_of(
+            ("embedded", "external"),
+            "a kind of core",
+            "embedded: the agent's own; external: a roscore that runs already",
+            "MODE",
+        ),
         "embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI.",
         key="core.mode",
         env="RMPA_CORE",
@@ -300,7 +343,13 @@ class Settings:
     )
     core_keep: str = setting(
         "auto",
-        CORE_KEEP,
+        word_of(
+            ("auto", "always", "never"),
+            "a choice",
+            "auto: if a node of the run before still runs, or the core died; always; never: begin empty, "
+            "as roscore does",
+            "WHEN",
+        ),
         "Restore nodes and parameters of the last run; auto: if one of its nodes still runs, or the core crashed.",
         key="core.keep",
         env="RMPA_KEEP",
@@ -315,7 +364,11 @@ class Settings:
     )
     core_port: int = setting(11311, PORT, "The ROS core's port.", key="core.port", option="--core-port")
     port: int = setting(
-        0, PORT_OR_ANY, "The mesh's port, TCP and UDP; 0: any free one.", key="mesh.port", option="--port"
+        0,
+        whole_number(0, 65535, "a port (0: any)", "PORT"),
+        "The mesh's port, TCP and UDP; 0: any free one.",
+        key="mesh.port",
+        option="--port",
     )
     interfaces: tuple[str, ...] = setting(
         (),
@@ -348,17 +401,13 @@ class Settings:
         key="bridge.transport",
         live=True,
     )
-    prefix_peers: bool = setting(
-        False,
-        BOOL,
+    prefix_peers: bool = switch(
         "Put each peer's name before its names here (/arm/odom of arm): for robots that use the same names.",
         key="bridge.prefix_peers",
         option="--prefix-peers",
         live=True,
     )
-    rosout: bool = setting(
-        False,
-        BOOL,
+    rosout: bool = switch(
         "Whether /rosout crosses; both modules need it. `rmpa log` shows the log of all modules without it.",
         key="bridge.rosout",
         live=True,
@@ -389,8 +438,8 @@ class Settings:
     record: RecordSettings = table(RecordSettings, "record", "RECORD")
     trust: TrustSettings = table(TrustSettings, "trust", "TRUST")
     gateway: GatewaySettings = table(GatewaySettings, "gateway", "GATEWAY", command="gateway")
-    relay: bool = setting(
-        False, BOOL, "Offer what comes from one peer to others that do not reach it themselves.", key="relay.enabled"
+    relay: bool = switch(
+        "Offer what comes from one peer to others that do not reach it themselves.", key="relay.enabled"
     )
     control_group: str = setting(
         "",
@@ -400,9 +449,19 @@ class Settings:
         shown_default="none",
     )
     log_level: str = setting(
-        "info", LOG_LEVEL, "debug, info, warning or error.", key="log.level", option="--log-level", live=True
+        "info",
+        word_of(
+            ("debug", "info", "warning", "error"),
+            "a log level",
+            "the levels are debug, info, warning, error",
+            "LEVEL",
+        ),
+        "debug, info, warning or error.",
+        key="log.level",
+        option="--log-level",
+        live=True,
     )
-    log_json: bool = setting(False, BOOL, "Log one JSON object a line.", key="log.json", option="--log-json")
+    log_json: bool = switch("Log one JSON object a line.", key="log.json", option="--log-json")
     runtime_dir: str = setting(
         "", TEXT, "The directory of the control sockets.", key="", shown_default="this user's runtime directory"
     )

@@ -1,20 +1,29 @@
-"""A TOML file: parsed, and its keys and types checked against a JSON Schema; each mistake has its line and key."""
+"""A TOML file: parsed, and its keys and types checked against a JSON Schema; each mistake has its line and key.
+
+A file of settings that another user may write is not obeyed, as ssh's StrictModes judges its own (sshd_config(5)).
+The file counts, each folder above it, and each link on the way. This user and root may write there, and under
+``sudo`` the user who called it.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import grp
+import os
+import pwd
 import re
+import stat
 import tomllib
 from bisect import bisect_left
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config import limits
-from rmpa.config.schema import REMOVED
 from rmpa.config.settings import SETTINGS
 from rmpa.config.values import JsonSchema, Place, did_you_mean, shown
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
     from rmpa.config.schema import Key
@@ -35,59 +44,38 @@ def value_at(table: object, place: Place) -> object:
 _PIECE: Final = re.compile(
     r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{\]}]|\n""", re.DOTALL
 )
+_CLOSES: Final = {"[": "]", "{": "}"}
 
 
-def _line_ends(text: str) -> Iterator[tuple[int, int]]:
-    """Each end of a line outside strings in a valid TOML text: the line's number, from 1, and the open brackets."""
-    line = depth = 0
+def _line_ends(text: str) -> Iterator[tuple[int, str]]:
+    """Each end of a line outside strings in a valid TOML text: the line's number, and what closes what is open."""
+    line, closing = 0, ""
     for match in _PIECE.finditer(text):
         piece = match[0]
-        depth += (piece in "[{") - (piece in "]}")
+        if piece in _CLOSES:
+            closing = _CLOSES[piece] + closing
+        elif piece in _CLOSES.values():
+            closing = closing[1:]
         line += piece.count("\n")
         if piece == "\n":
-            yield line, depth
+            yield line, closing
 
 
 def line_of(text: str, place: Place) -> int | None:
     """The line, from 1, on which the key or element at a place begins in a valid TOML text; ``None`` if it has none.
 
-    A prefix that ends with a statement is valid TOML. The first of these that contains the place ends with its
-    statement, which begins where the one before ends. An element of a list is searched within its statement.
+    What stands before the end of a line, its brackets closed, is valid TOML. The first of these texts that contains
+    the place has it behind the one before.
     """
     lines = text.split("\n")
-    ends = [0, *(line for line, depth in _line_ends(text) if not depth), len(lines)]
+    ends = [(0, ""), *_line_ends(text), (len(lines), "")]
 
-    def has_place(end: int) -> bool:
-        return value_at(tomllib.loads("\n".join(lines[:end])), place) is not None
+    def has_place(end: tuple[int, str]) -> bool:
+        return value_at(tomllib.loads("\n".join((*lines[: end[0]], end[1]))), place) is not None
 
-    if not has_place(len(lines)):
+    if not has_place(ends[-1]):
         return None
-    at = bisect_left(ends, True, key=has_place)
-    return _element_line(lines, ends[at - 1], ends[at], place)
-
-
-def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
-    """The line of a place in the statement between two lines: not its first only for an element of a list."""
-    if begin + 1 == end:
-        return end
-    text = "\n".join(lines[begin:end])
-    inline = value_at(tomllib.loads(text), place) is not None
-    indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
-    if not indices:
-        return begin + 1
-
-    def has_element(line: int) -> bool:
-        try:
-            value: object = tomllib.loads("\n".join(lines[begin : begin + line]) + "\n]")
-        except ValueError:
-            return False
-        while isinstance(value, dict) and value:
-            value = next(iter(value.values()))
-        return isinstance(value, list) and len(value) > indices[0]
-
-    stops = [line for line, depth in _line_ends(text) if depth == 1]
-    at = bisect_left(stops, True, key=has_element)
-    return begin + stops[at] if at < len(stops) else end
+    return ends[bisect_left(ends, True, key=has_place) - 1][0] + 1
 
 
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
@@ -162,8 +150,7 @@ def _mistakes(place: Place, value: object, schema: JsonSchema, root: JsonSchema)
         for key, inner in value.items():
             if known and key not in known and not other:
                 what = "an unknown table" if isinstance(inner, dict) else "an unknown key"
-                remedy = REMOVED.get(dotted((*place, key))) or _suggestion(place, key, list(known), root)
-                yield (*place, key), what, remedy
+                yield (*place, key), what, _suggestion(place, key, list(known), root)
             yield from _mistakes((*place, key), inner, known.get(key, other), root)
 
 
@@ -236,3 +223,78 @@ def _keys(schema: JsonSchema, table: Key = ()) -> Iterator[Key]:
             yield from _keys(named, (*table, name, "NAME"))
         else:
             yield (*table, name)
+
+
+def check_writers(path: Path, environ: Mapping[str, str], key: str) -> None:
+    """Refuse a file of settings that another user may write; arguments as for ``other_writer``, and what names it.
+
+    Raises:
+        ConfigError: One may.
+        OSError: A part of the path is gone.
+    """
+    if (found := other_writer(path, environ)) is not None:
+        raise ConfigError(key, f"is not obeyed: {found[0]}", found[1], path, code="settings-exposed")
+
+
+def other_writer(path: Path, environ: Mapping[str, str]) -> tuple[str, str] | None:
+    """What of a file's path another user may write, and what to do; ``None``: nothing.
+
+    Args:
+        path: Of a file that is there.
+        environ: Has SUDO_UID under ``sudo``.
+
+    Raises:
+        OSError: A part of the path is gone.
+    """
+    own = {0, os.geteuid()}
+    caller = environ.get("SUDO_UID", "")
+    if os.geteuid() == 0 and caller.isdecimal():
+        own.add(int(caller))
+    for part in _way(path.absolute()):
+        if found := _problem(part, own):
+            return found
+    return None
+
+
+def _way(path: Path) -> Iterator[Path]:
+    """A path, the folders above it, and the same of what a link on the way leads to."""
+    waiting, seen = [path], set()
+    while waiting:
+        at = waiting.pop()
+        for part in (at, *at.parents):
+            if part not in seen:
+                seen.add(part)
+                yield part
+                if part.is_symlink():
+                    waiting.append(part.parent / part.readlink())
+
+
+def _problem(part: Path, own: Collection[int]) -> tuple[str, str] | None:
+    info = part.lstat()
+    part = part if stat.S_ISLNK(info.st_mode) else part.resolve()  # it is shown without dots
+    if os.statvfs(part).f_flag & os.ST_RDONLY:
+        return None  # a container's settings, mounted so
+    if info.st_uid not in own:
+        return f"{part} belongs to user {info.st_uid}", f"chown {os.geteuid()} {part}; in a container mount it :ro"
+    folder, mode = stat.S_ISDIR(info.st_mode), stat.S_IMODE(info.st_mode)
+    # In a folder such as /tmp each user writes what is its own alone.
+    if stat.S_ISLNK(info.st_mode) or (folder and mode & stat.S_ISVTX):
+        return None
+    if mode & stat.S_IWOTH:
+        return f"every user may write {part} (mode {mode:o})", f"chmod o-w {part}"
+    if mode & stat.S_IWGRP and not _is_private(part, info.st_gid, own):
+        return f"users of group {info.st_gid} may write {part} (mode {mode:o})", f"chmod g-w {part}"
+    return None
+
+
+def _is_private(part: Path, group: int, own: Collection[int]) -> bool:
+    """Whether a group that may write has no other user, as the one that Debian makes for each user."""
+    with contextlib.suppress(OSError):
+        if "system.posix_acl_access" in os.listxattr(part):
+            return False  # the group's rights are then the bound of all that the list names
+    try:
+        members = grp.getgrgid(group).gr_mem
+        users = [pwd.getpwnam(name).pw_uid for name in members]
+    except KeyError:
+        return False
+    return {*users, *(each.pw_uid for each in pwd.getpwall() if each.pw_gid == group)} <= {*own}

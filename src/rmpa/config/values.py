@@ -166,23 +166,6 @@ def member_of(kind: type[_Word], what: str) -> ValueType[_Word]:
     return ValueType(lambda raw: kind(one.read(raw)), one.json_schema)
 
 
-LOG_LEVEL: Final = word_of(
-    ("debug", "info", "warning", "error"), "a log level", "the levels are debug, info, warning, error", "LEVEL"
-)
-CORE_KEEP: Final = word_of(
-    ("auto", "always", "never"),
-    "a choice",
-    "auto: if a node of the run before still runs, or the core died; always; never: begin empty, as roscore does",
-    "WHEN",
-)
-CORE_MODE: Final = word_of(
-    ("embedded", "external"),
-    "a kind of core",
-    "embedded: the agent's own; external: a roscore that runs already",
-    "MODE",
-)
-
-
 def _read_bool(raw: object) -> bool:
     """``true`` or ``false``, also as 1, 0, yes, no, on, off."""
     value = _BOOLEANS.get(str(raw).strip().lower())
@@ -210,11 +193,8 @@ def whole_number(low: int, high: int, what: str, metavar: str = "N") -> ValueTyp
 BOOL: Final = ValueType(_read_bool, {"type": "boolean"})
 DOMAIN: Final = whole_number(0, core_limits.DOMAIN_MAX, "a domain id")
 PORT: Final = whole_number(1, 65535, "a port", "PORT")
-COMMAND_AGE: Final = whole_number(0, 60_000, "milliseconds (0: any age)", "MS")
-PORT_OR_ANY: Final = whole_number(0, 65535, "a port (0: any)", "PORT")
 DSCP: Final = whole_number(0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
 PACKET_PRIORITY: Final = whole_number(0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
-FIFO_PRIORITY: Final = whole_number(1, 99, "a priority of SCHED_FIFO")
 BOUND: Final = whole_number(1, limits.BOUND_MAX, "a limit")
 
 # By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1.

@@ -14,6 +14,20 @@ from rmpa.core.statistics import SampleSpread
 CONFLICT, DENIED, CROWDED = "conflict", "denied", "crowded"
 
 
+class ModuleAnswer(msgspec.Struct, frozen=True, kw_only=True):
+    """What one module answers to a question that several are asked; for subclasses.
+
+    Attributes:
+        module: Its name, as the asking module knows it.
+        problem: Why it does not tell, or has not done it; empty: it has.
+        code: That of the problem, by ``core.codes``.
+    """
+
+    module: str = ""
+    problem: str = ""
+    code: str = ""
+
+
 class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The file descriptors of the agent's process.
 

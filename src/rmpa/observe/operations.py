@@ -15,7 +15,7 @@ from rmpa.bridge.kept import Kept
 from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.log_ring import ModuleLog
-from rmpa.bridge.params import transfer
+from rmpa.bridge.params import owner as param_requests
 from rmpa.bridge.recordings import ModuleRecordings
 from rmpa.bridge.topics.rates import RATES
 from rmpa.config.rules import ROS2
@@ -108,7 +108,7 @@ class ControlOperations:
 
     async def param(self, args: Args) -> Any:
         """Pass a request about parameters on to a peer: ``peer``, ``what``, and its ``key`` and ``text``."""
-        what, session = _request(args, transfer.QUESTIONS), self._session(args.get("peer", ""))
+        what, session = _request(args, param_requests.QUESTIONS), self._session(args.get("peer", ""))
         inner: Args = {name: args[name] for name in ("key", "text") if name in args}
         return await self.facts.bridge.rpc.request(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
 
@@ -133,7 +133,7 @@ class ControlOperations:
         """
         what, peer = _request(args, node_requests.REPLIES), args.get("peer")
         if peer is None and what == node_requests.NODE_INFO:
-            return await self.nodes.info(args)
+            return await self.nodes.info(None, args)
         if peer is None:
             return await asyncio.gather(*map(self._nodes_of, self.facts.bridge.sessions.linked()))
         session = self._session(peer)
@@ -177,7 +177,7 @@ class ControlOperations:
             if names is None or any(is_meant(name, session.link.name, str(session.link.guid)) for name in names)
         ]
         told = await self._of_peers(peers, node_requests.TOP)
-        return ({self.name: await self.nodes.top()} if names is None or self.name in names else {}) | told
+        return ({self.name: await self.nodes.top(None, {})} if names is None or self.name in names else {}) | told
 
     async def _of_peers(self, peers: list[PeerSession], what: str) -> dict[str, Any]:
         """The answers of peers to a request, by name; a text where one does not give any."""
@@ -194,7 +194,7 @@ class ControlOperations:
         """The levels of a ``node``'s loggers; ``level``: sets that of a ``logger``. ``peer``: the node's module."""
         request = {name: str(args[name]) for name in ("node", "logger", "level") if args.get(name)}
         if not (peer := args.get("peer")):
-            return await self.facts.bridge.log.level(request)
+            return await self.facts.bridge.log.level(None, request)
         return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
 
     async def record(self, args: Args) -> Any:
@@ -278,7 +278,7 @@ def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]
     for name, one in found:
         if name == "/":
             raise RmpaError(f"the root can only be set to a dictionary, not to {one!r}")
-        if problem := transfer.key_problem(name):
+        if problem := param_requests.key_problem(name):
             raise RmpaError(problem)
     return found
 
@@ -314,11 +314,11 @@ class PeerParams:
         Raises:
             RmpaError: There is none, or the peer does not answer or refuses.
         """
-        return self._value(transfer.GET, key=key)
+        return self._value(param_requests.GET, key=key)
 
     def names(self) -> list[str]:
         """The names of all parameters that may be read, in order; errors as for ``get``."""
-        value = self._value(transfer.NAMES)
+        value = self._value(param_requests.NAMES)
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
@@ -329,15 +329,15 @@ class PeerParams:
         except LocalProtocolError as error:
             raise RmpaError(f"{key}: {error}") from None
         if len(text) > bridge_limits.PARAM_TEXT_MAX:
-            raise RmpaError(transfer.too_large(key, len(text)), code="limit-reached")
-        return transfer.count_of(self._ask(transfer.SET, key=key, text=text.decode()))
+            raise RmpaError(param_requests.too_large(key, len(text)), code="limit-reached")
+        return param_requests.count_of(self._ask(param_requests.SET, key=key, text=text.decode()))
 
     def delete(self, key: str) -> None:
         """Delete a parameter or namespace; errors as for ``get``."""
-        self._ask(transfer.DELETE, key=key)
+        self._ask(param_requests.DELETE, key=key)
 
     def _value(self, what: str, **args: str) -> XmlRpcValue:
-        return parse_response(transfer.text_of(self._ask(what, **args)).encode())
+        return parse_response(param_requests.text_of(self._ask(what, **args)).encode())
 
     def _ask(self, what: str, **args: str) -> object:
         return _passed_on(self.client, "param", dict[str, Any], peer=self.peer, what=what, **args)

@@ -20,7 +20,7 @@ from rmpa.ros.http.rpc import call_api
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.config.recording import RecordSettings
+    from rmpa.config.settings import RecordSettings
     from rmpa.core.facts import TopicInfo
     from rmpa.ros.node.endpoints import Subscriber
     from rmpa.ros.node.node import Node

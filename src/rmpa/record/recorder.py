@@ -16,7 +16,7 @@ import msgspec
 
 from rmpa import client
 from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, recording_id, request_keep
-from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST, RecordSettings
+from rmpa.config.settings import ALARM, CONTRACT, NODE_DIED, PEER_LOST, RecordSettings
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches_any
 from rmpa.observe.control_client import ControlClient, choose_agent

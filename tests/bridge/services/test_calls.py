@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget, LocalService, ServicePool
-from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Server
+from rmpa.bridge.services.calls import Budgets, CallStats, Server, ShownService
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
@@ -168,9 +168,15 @@ class Ends:
     def __init__(self) -> None:
         self.there, self.back = Wire(), Wire()
         self.pool = Pool()
-        self.stats, self.served = CallStats(), CallStats()
+        self.served = CallStats()
         self.budgets, self.budgets_there = Budgets(), Budgets()
-        self.caller = Caller(self.there, 2, "service [/add] of base", self.budgets, self.stats, DESCRIPTION)
+        self.there.name = "base"
+        remote: Any = SimpleNamespace(name="/add", requests=2)
+        session: Any = SimpleNamespace(link=self.there)
+        self.wanted: list[ShownService] = []
+        self.caller = ShownService(remote, session, self.wanted.append)
+        self.caller.open(DESCRIPTION, self.budgets)
+        self.stats = self.caller.stats
         self.time = LinkTime()
         self.server = Server(
             self.back, 1, cast("ServicePool", self.pool), 7.0, self.budgets_there, self.served, self.time

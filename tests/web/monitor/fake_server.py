@@ -477,9 +477,9 @@ class FakeServer:
             found = self.logs[module].find(query, now) if module in self.logs else None
             error = {"pc": 0.0, "base": 0.0001}.get(module, 0.012)
             told.append(
-                ModuleLog(module, found.lines, found.next, found.lost, error)
+                msgspec.structs.replace(found, module=module, error=error)
                 if found is not None
-                else ModuleLog(module, problem=self.log_problems.get(module, "it is silent"))
+                else ModuleLog(module=module, problem=self.log_problems.get(module, "it is silent"))
             )
         return msgspec.to_builtins(told)
 

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.owner import ParamCore, ParamOwner, read_text
-from rmpa.bridge.params.transfer import follow_rules
+from rmpa.bridge.params.owner import FOLLOW, VALUE, ParamCore, ParamOwner, follow_rules, read_text, text_of
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.sessions import Part
 from rmpa.config.rules import SIM_TIME, overlap
@@ -93,7 +91,7 @@ class Params(Part):
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
         own = Needs((), "what `[[param]]` follows from this very peer")
-        bridge.rpc.on_request(transfer.VALUE, self._told, own)
+        bridge.rpc.on_request(VALUE, self._told, own)
 
     def notes(self) -> tuple[str, ...]:
         """Messages to the user about parameters that are not followed although their owner is linked."""
@@ -146,7 +144,7 @@ class Params(Part):
 
     def reconcile(self) -> None:
         """Compare the values in the background, and mend differences."""
-        if self._looking is None:
+        if self._looking is None or self._looking.done():
             self._looking = start_task(self._look(), "look at parameters")
 
     async def close(self) -> None:
@@ -169,8 +167,6 @@ class Params(Part):
             pass  # reported by the core itself
         except RmpaError as error:
             _log.warning("! parameters cannot be read: %s [param-trouble]", error)
-        finally:
-            self._looking = None
 
     def _claim(self, session: PeerSession) -> bool:
         """Follow a linked peer's parameters that no other peer of its name owns; return whether there are any."""
@@ -187,7 +183,7 @@ class Params(Part):
         return bool(mine)
 
     def _ask(self, session: PeerSession) -> None:
-        if session.peer not in self._asking:
+        if (asking := self._asking.get(session.peer)) is None or asking.done():
             name = f"follow parameters of {session.link.name}"
             self._asking[session.peer] = start_task(self._follow(session), name)
 
@@ -195,13 +191,10 @@ class Params(Part):
         mine = [entry for entry in self.followed if entry.peer == session.peer]
         keys = [entry.rule.key for entry in mine]
         try:
-            answer = await self._bridge.rpc.request(session, transfer.FOLLOW, {"keys": keys})
+            answer = await self._bridge.rpc.request(session, FOLLOW, {"keys": keys})
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
-        finally:
-            if self._asking.get(session.peer) is asyncio.current_task():
-                del self._asking[session.peer]
         for entry in mine:
             if entry.peer == session.peer and entry.rule.key in refused:
                 self._refused(entry, str(refused[entry.rule.key]))
@@ -218,7 +211,7 @@ class Params(Part):
         """
         text, refused = args.get("text"), args.get("refused")
         if text is not None:
-            transfer.text_of(args)
+            text_of(args)
         for entry in self.followed:
             if (entry.peer, entry.rule.key) != (session.peer, args.get("key")):
                 continue
@@ -263,25 +256,20 @@ class Params(Part):
         _log.info("= %s is no longer followed, and as before: %s", SIM_TIME, "not set" if text is None else "set")
 
     def _work_soon(self) -> None:
-        if self._working is None and any(entry.due for entry in self.followed):
+        idle = self._working is None or self._working.done()
+        if idle and any(entry.due for entry in self.followed):
             self._working = start_task(self._work(), "follow parameters")
 
     async def _work(self) -> None:
         """Set the values that are due; ``look`` tries again what failed."""
-        try:
-            while todo := [entry for entry in self.followed if entry.due]:
-                for entry in todo:
-                    try:
-                        await self._apply(entry)
-                    except RmpaError as error:
-                        entry.problem = str(error)
-                        self._refuse(
-                            "param.failed",
-                            str(entry.rule),
-                            f"{entry.rule} cannot be set as its owner has it: {error}",
-                        )
-        finally:
-            self._working = None
+        while todo := [entry for entry in self.followed if entry.due]:
+            for entry in todo:
+                try:
+                    await self._apply(entry)
+                except RmpaError as error:
+                    entry.problem = str(error)
+                    text = f"{entry.rule} cannot be set as its owner has it: {error}"
+                    self._refuse("param.failed", str(entry.rule), text)
 
     async def _apply(self, entry: Followed) -> None:
         """Set a value here, unless it is there already; a malformed text changes nothing."""

@@ -1,6 +1,15 @@
-"""The owner's side of parameters: answers what peers read, set, delete and follow of the local core.
+"""The owner's side of parameters: which of this module's peers may read, set, delete and follow, and their requests.
 
-The parameters of the local core as XML-RPC text; long values are converted without blocking the event loop.
+Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON has neither
+binary data nor dates. ``bridge.rpc`` carries large ones aside of commands. ::
+
+    param.get {key}                → {text}
+    param.names {}                 → {text}       a list of the names of all parameters that may be read
+    param.set {key, text}          → {count}
+    param.delete {key}             → {}
+    param.follow {keys}            → {refused}    from now on the owner asks:
+    param.value {key, text}        → null         the value now; text null: there is none
+    param.value {key, refused}     → null         it may not be followed any more
 """
 
 from __future__ import annotations
@@ -8,24 +17,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.params import transfer
-from rmpa.bridge.params.transfer import (
-    key_problem,
-    replaced,
-    too_large,
-    why_not_follow,
-    why_not_get,
-    why_not_set,
-)
 from rmpa.bridge.policy import Needs
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
-from rmpa.config.rules import overlap
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, RmpaError
-from rmpa.core.identity import OWN_NODE
+from rmpa.config.rules import SIM_TIME, FollowRule, overlap, untouchable
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, PeerRefused, RemoteProtocolError, RmpaError
+from rmpa.core.identity import OWN_NODE, matches_any
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
 from rmpa.ros.wire.xmlrpc import response_pieces
@@ -34,7 +36,7 @@ from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import refusal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.policy import PermissionGate
@@ -44,6 +46,17 @@ if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
+_log = logging.getLogger(__name__)
+
+GET: Final = "param.get"
+NAMES: Final = "param.names"
+SET: Final = "param.set"
+DELETE: Final = "param.delete"
+FOLLOW: Final = "param.follow"
+VALUE: Final = "param.value"
+# The requests that the command line may have its agent send.
+QUESTIONS: Final = (GET, NAMES, SET, DELETE)
+
 # The caller's name when parameters are set for peers. A core does not notify a node of its own changes, and the
 # agent's node has to be notified of these.
 PEERS: Final = f"{OWN_NODE}/peers"
@@ -51,6 +64,122 @@ PEERS: Final = f"{OWN_NODE}/peers"
 _ALL: Final = frozenset({"/**", "**"})
 # Pieces, of some KiB each, that are written before the event loop goes on with other tasks.
 _PIECES: Final = 16
+_EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
+
+
+_ROOT: Final = "the root holds every parameter: name those that you mean"
+
+
+def replaced(names: Iterable[str], at: str, present: XmlRpcValue) -> Iterator[str]:
+    """Yield the parameters that are lost if others are set: a value becomes a namespace, or a namespace a value.
+
+    Args:
+        names: The parameters that are set; all are ``at``, or below it.
+        at: The name of the present value, a namespace around them all.
+        present: The value; empty if there is none.
+    """
+    given = set(names)
+    around = set(chain.from_iterable(map(_namespaces, given)))
+    for name, _ in leaves(at, present):
+        if name in around or not given.isdisjoint(_namespaces(name)):
+            yield name
+
+
+def _namespaces(name: str) -> list[str]:
+    """The namespaces around a parameter, without the root."""
+    parts = name.split("/")
+    return ["/".join(parts[:length]) for length in range(2, len(parts))]
+
+
+def key_problem(key: object) -> str:
+    """Why a key from a peer is not a parameter's global name; empty if it is one."""
+    if not isinstance(key, str) or not key.startswith("/"):
+        return f"{str(key)[:100]!r} is not the global name of a parameter"
+    if len(key) > config_limits.CROSSING_NAME_MAX or key.count("/") > ros_limits.PARAM_DEPTH_MAX:
+        return f"the name of a parameter has {len(key)} characters, or too many namespaces"
+    # Masters accept any characters, and names such as joint-1 have long been in use.
+    if "//" in key or not key.isprintable() or any(c.isspace() for c in key):
+        return f"{key[:100]!r} is not a parameter's name"
+    return ""
+
+
+def why_not_get(settings: Settings, key: str) -> str:
+    """Why peers may not read a parameter; empty if they may."""
+    if matches_any(settings.params.remote_get, key):
+        return ""
+    return f"{key} may not be read by peers: no glob of params.remote_get fits"
+
+
+def why_not_set(settings: Settings, key: str) -> str:
+    """Why peers may not set or delete a parameter; empty if they may."""
+    if key == "/":
+        return _ROOT
+    if why := untouchable(key):
+        return f"{key} is never set from another module: {why}"
+    for rule in settings.params.follow:
+        if overlap(rule.to, key):
+            owner = f"{rule.owner}:{rule.key}"
+            return f"{key} cannot be set here: it is followed from {owner} ([[param]]); ask or set it there"
+    if matches_any(settings.params.remote_set, key):
+        return ""
+    return f"{key} may not be set by peers: no glob of params.remote_set fits"
+
+
+def why_not_follow(settings: Settings, key: str) -> str:
+    """Why peers may not follow a parameter; empty if they may."""
+    if key == "/":
+        return _ROOT
+    if overlap(key, SIM_TIME):
+        if owner := settings.time.follow:
+            return f"time comes from {owner} here; follow that one's"
+        return "" if settings.time.share else "this module does not share its time; set share = true in its [time]"
+    for rule in settings.params.follow:
+        if overlap(rule.to, key):
+            # If two modules followed each other, their values would never settle.
+            return f"{rule.to} is followed from {rule.owner}:{rule.key} here; follow that one"
+    return why_not_get(settings, key)
+
+
+def follow_rules(settings: Settings) -> tuple[FollowRule, ...]:
+    """All parameters that this module follows, including the time if ``[time]`` has it followed."""
+    owner = settings.time.follow
+    return settings.params.follow + ((FollowRule(SIM_TIME, owner, SIM_TIME),) if owner else ())
+
+
+def text_of(fields: object) -> str:
+    """The value in a request to set a parameter, or in the answer to ``param.get`` or ``param.names``.
+
+    Raises:
+        RemoteProtocolError: There is none.
+        LimitExceeded: It is above ``limits.PARAM_TEXT_MAX``.
+    """
+    text = fields.get("text") if isinstance(fields, dict) else None
+    if not isinstance(text, str):
+        raise RemoteProtocolError("the text of a parameter's value is missing")
+    if len(text) > limits.PARAM_TEXT_MAX:
+        raise LimitExceeded("parameter", len(text), limits.PARAM_TEXT_MAX)
+    return text
+
+
+def count_of(answer: object) -> int:
+    """How many parameters were set.
+
+    Raises:
+        RemoteProtocolError: The answer does not say it.
+    """
+    count = answer.get("count") if isinstance(answer, dict) else None
+    if not isinstance(count, int):
+        raise RemoteProtocolError(f"an answer about a parameter that is none: {str(answer)[:100]!r}")
+    return count
+
+
+def too_large(key: str, size: int) -> str:
+    """The error text for a value that is too large to cross."""
+    most = limits.PARAM_TEXT_MAX
+    return (
+        f"{key} has {size} characters as XML-RPC text, above the {most} ({most >> 20} MiB) that cross between "
+        "modules; take its parts one by one, or let a latched topic carry it"
+    )
 
 
 async def write_text(what: str, value: XmlRpcValue) -> str:
@@ -146,14 +275,6 @@ class ParamCore:
             self.subscribed.discard(key)
 
 
-# Answers the peers' requests about this module's parameters, and notifies them of changes of those they follow.
-
-
-_log = logging.getLogger(__name__)
-
-_EACH: Final = Needs((Access.PARAM,), "each parameter, all within a namespace and all that would be lost")
-
-
 @dataclass(slots=True, eq=False)
 class _Follower:
     """A peer that follows parameters of this module.
@@ -184,12 +305,12 @@ class ParamOwner:
         self._bridge = bridge
         self._followers: dict[int, _Follower] = {}
         rpc = bridge.rpc
-        rpc.on_request(transfer.GET, self._get, _EACH)
-        rpc.on_request(transfer.NAMES, self._names, Needs((Access.PARAM,), "each parameter; others are left out"))
-        rpc.on_request(transfer.SET, self._set, _EACH)
-        rpc.on_request(transfer.DELETE, self._delete, _EACH)
+        rpc.on_request(GET, self._get, _EACH)
+        rpc.on_request(NAMES, self._names, Needs((Access.PARAM,), "each parameter; others are left out"))
+        rpc.on_request(SET, self._set, _EACH)
+        rpc.on_request(DELETE, self._delete, _EACH)
         again = Needs((Access.PARAM,), "each parameter, and again at each change")
-        rpc.on_request(transfer.FOLLOW, self._follow, again)
+        rpc.on_request(FOLLOW, self._follow, again)
 
     @property
     def _settings(self) -> Settings:
@@ -271,7 +392,7 @@ class ParamOwner:
 
     async def _set(self, session: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         key, peer = self._key(args.get("key")), session.link.name
-        value = await read_text(transfer.text_of(args))
+        value = await read_text(text_of(args))
         parameters: list[tuple[str, XmlRpcValue]] = []
         for given, one in yielding_to_data(leaves(key, value)):
             if len(parameters) >= limits.PARAMS_SET_MAX:
@@ -367,22 +488,20 @@ class ParamOwner:
     def _tell_soon(self, follower: _Follower, keys: set[str]) -> None:
         for key in keys:
             follower.told.pop(key, None)
-        if follower.task is None and not follower.keys <= follower.told.keys():
+        idle = follower.task is None or follower.task.done()
+        if idle and not follower.keys <= follower.told.keys():
             name = f"tell {follower.session.link.name} of parameters"
             follower.task = start_task(self._tell(follower), name)
 
     async def _tell(self, follower: _Follower) -> None:
         """Tell a peer the present values of what has changed, one after the other; what fails is left to ``look``."""
-        try:
-            while not follower.keys <= follower.told.keys():
-                await asyncio.sleep(limits.PARAM_GATHER)
-                for key in follower.keys - follower.told.keys():
-                    follower.told[key] = 0  # before it is read: a change meanwhile takes the mark away
-                    if key in follower.keys and not await self._tell_one(follower, key):
-                        follower.told.pop(key, None)
-                        return
-        finally:
-            follower.task = None
+        while not follower.keys <= follower.told.keys():
+            await asyncio.sleep(limits.PARAM_GATHER)
+            for key in follower.keys - follower.told.keys():
+                follower.told[key] = 0  # before it is read: a change meanwhile takes the mark away
+                if key in follower.keys and not await self._tell_one(follower, key):
+                    follower.told.pop(key, None)
+                    return
 
     async def _tell_one(self, follower: _Follower, key: str) -> bool:
         """Tell a peer a parameter's present value, or why it may not follow it; return whether that has arrived."""
@@ -402,7 +521,7 @@ class ParamOwner:
                 why = str(error)
         args = {"key": key, "refused": why} if why else {"key": key, "text": text}
         try:
-            await self._bridge.rpc.request(follower.session, transfer.VALUE, args, limits.PARAM_ASK_TIMEOUT)
+            await self._bridge.rpc.request(follower.session, VALUE, args, limits.PARAM_ASK_TIMEOUT)
         except RmpaError as error:
             _log.warning(
                 "! %s does not get the parameter %s: %s [param-trouble]", follower.session.link.name, key, error

@@ -1,4 +1,4 @@
-"""Both ends of an open service: ``Caller`` at the clients' module, ``Server`` at the server's module."""
+"""Both ends of a service: ``ShownService`` at the clients' module, ``Server`` at the server's module."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ from rmpa.core.identity import SERIAL_MASK, is_type_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.http.rpc import is_own_name
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
+from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.reception import LinkTime
-    from rmpa.bridge.services.books import ServiceExports, ServiceRoute
+    from rmpa.bridge.services.books import RemoteService, ServiceExports, ServiceRoute
+    from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
-    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+    from rmpa.ros.node.slave_node import SlaveNode
+    from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.runtime.tls import Buffer
 
 _OK: Final = b"\x01"
@@ -79,53 +82,85 @@ class CallStats:
         self.problem = problem[: limits.CONTROL_TEXT_MAX]
 
 
-class Caller(BodyReceiver):
-    """Calls one service of a peer, for all clients of this module.
+class ShownService(BodyReceiver):
+    """A peer's service in the local graph, and its calls by all clients of this module.
 
     Args:
-        link: The link to the peer.
-        requests: The route of requests; the peer has chosen its number.
-        what: The service and its peer, for texts.
-        budgets: The budgets of the peer's link.
-        stats: The counts of the service.
-        description: Its types, as its server told them when it was opened.
+        remote: The service.
+        session: The peer.
+        want: ``(self)``: called when calls, or questions for its types, wait until it is open.
 
     Attributes:
+        stats: Counts and latencies of its calls.
+        proxy: The proxy of its node; ``None`` until that exists.
+        endpoint: The endpoint that clients connect to; ``None`` until the proxy exists.
+        mismatch: The error that the last client with another MD5 sum got; empty if there was none.
+        description: Its types, as its server told them when it was opened.
+        asking: Questions for its types that wait until it is open.
         used_at: When a call was last begun or answered, in the event loop's seconds.
     """
 
-    def __init__(
-        self,
-        link: PeerLink,
-        requests: int,
-        what: str,
-        budgets: Budgets,
-        stats: CallStats,
-        description: ServiceDescription,
-    ) -> None:
-        super().__init__(budgets.incoming)
-        self.description: Final = description
-        self._sender = BodySender(link, requests)
-        self._what = what
-        self._outgoing = budgets.outgoing
-        self._stats = stats
+    def __init__(self, remote: RemoteService, session: PeerSession, want: Callable[[ShownService], None]) -> None:
+        super().__init__(Budget())  # that of the link is taken when it is opened
+        self.remote = remote
+        self.session = session
+        self.stats = CallStats()
+        self.proxy: SlaveNode | None = None
+        self.endpoint: ServiceEndpoint | None = None
+        self.mismatch = ""
+        self.description: ServiceDescription | None = None
+        self.asking: list[asyncio.Future[ServiceDescription | str]] = []
+        self.used_at = 0.0
+        self._want = want
         self._loop = asyncio.get_running_loop()
+        self._sender: BodySender | None = None
+        self._outgoing = self._budget
         self._serial = 0
         self._pending: dict[int, tuple[ServiceCall, float, bool]] = {}
-        self.used_at = self._loop.time()
+        self._waiting: list[ServiceCall] = []
+
+    @property
+    def text(self) -> str:
+        """The service and its peer, for texts."""
+        return f"service [{self.remote.name}] of {self.session.link.name}"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be called now."""
+        return self._sender is not None
 
     @property
     def active(self) -> int:
         """The number of calls under way."""
         return len(self._pending)
 
+    @property
+    def wanted(self) -> bool:
+        """Whether something waits until it is open."""
+        return bool(self._waiting or self.asking)
+
+    def open(self, about: ServiceDescription, budgets: Budgets) -> None:
+        """Begin to call it: requests go out on ``remote.requests``; ``budgets`` are those of the peer's link."""
+        self._sender = BodySender(self.session.link, self.remote.requests)
+        self._budget, self._outgoing = budgets.incoming, budgets.outgoing
+        self.description, self.used_at = about, self._loop.time()
+        self._answer(about)
+        waiting, self._waiting = self._waiting, []
+        for call in waiting:
+            self.call(call)
+
     def call(self, call: ServiceCall) -> None:
-        """Send a call's request; the call ends with the reply, or with an error."""
-        stats = self._stats
+        """Send a call's request, or have it wait; the call ends with the reply, or with an error. The hot path."""
+        sender, stats = self._sender, self.stats
+        if sender is None:
+            self._waiting.append(call)
+            call.on_gone = lambda: self._waiting.remove(call) if call in self._waiting else None
+            self._want(self)
+            return
         stats.calls += 1
         size = len(call.request)
         if not self._outgoing.take(size):
-            text = f"{self._what}: more than {self._outgoing.limit >> 20} MiB of calls are under way; try again later"
+            text = f"{self.text}: more than {self._outgoing.limit >> 20} MiB of calls are under way; try again later"
             stats.fail(text)
             call.fail(text)
             return
@@ -134,7 +169,7 @@ class Caller(BodyReceiver):
         call.on_gone = partial(self._gone, serial)
         now = self.used_at = self._loop.time()
         self._pending[serial] = (call, now, size > mesh_limits.EXPRESS_MESSAGE_MAX)
-        self._sender.send(serial, call.request)
+        sender.send(serial, call.request)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """Handle a reply; it is dropped if its call has ended already."""
@@ -144,9 +179,9 @@ class Caller(BodyReceiver):
         now = self.used_at = self._loop.time()
         ok = body[:1] == _OK
         if ok:
-            self._stats.latencies.append(now - began)
+            self.stats.latencies.append(now - began)
         else:
-            self._stats.fail(_text(memoryview(body)[1:]))
+            self.stats.fail(_text(memoryview(body)[1:]))
         if isinstance(body, bytearray):
             del body[:1]  # costs nothing; a copy of a large one would
             call.reply(ok, body)
@@ -155,7 +190,7 @@ class Caller(BodyReceiver):
 
     def failed(self, sequence: int, reason: str) -> None:
         """Fail the call of a reply whose rest was lost."""
-        self._fail(sequence, f"{self._what}: its reply was lost on the way: {reason}")
+        self._fail(sequence, f"its reply was lost on the way: {reason}")
 
     def lane_lost(self) -> None:
         """Fail the calls with large requests, and drop a reply in parts: the bulk lane's connection is gone.
@@ -165,32 +200,49 @@ class Caller(BodyReceiver):
         self.drop("the connection for large messages was lost")
         for sequence, (_, _, bulk) in list(self._pending.items()):
             if bulk:
-                self._fail(
-                    sequence, f"{self._what}: the connection for large messages was lost in the middle of the call"
-                )
+                self._fail(sequence, "the connection for large messages was lost in the middle of the call")
 
     def close(self, reason: str) -> None:
-        """Fail the calls under way with this reason, and send nothing more."""
+        """Call it no more: the calls under way fail with this reason, and so do those that wait."""
         self.discard()
         for sequence in list(self._pending):
-            self._fail(sequence, f"{self._what}: {reason}")
-        self._sender.close()
+            self._fail(sequence, reason)
+        if self._sender is not None:
+            self._sender.close()
+            self._sender = None
+        self.fail_waiting(f"{self.text}: {reason}")
 
-    def _fail(self, sequence: int, text: str) -> None:
+    def fail_waiting(self, text: str) -> None:
+        """End what waits until it is open with an error."""
+        self._answer(text)
+        waiting, self._waiting = self._waiting, []
+        for call in waiting:
+            self.stats.calls += 1
+            self.stats.fail(text)
+            call.fail(text)
+
+    def _answer(self, about: ServiceDescription | str) -> None:
+        asking, self.asking = self.asking, []
+        for future in asking:
+            if not future.done():
+                future.set_result(about)
+
+    def _fail(self, sequence: int, reason: str) -> None:
         if (found := self._end(sequence)) is not None:
-            self._stats.fail(text)
+            text = f"{self.text}: {reason}"
+            self.stats.fail(text)
             found[0].fail(text)
 
     def _gone(self, sequence: int) -> None:
         """End a call whose client has left, or whose deadline is over."""
         if (found := self._end(sequence)) is not None:
             late = self._loop.time() >= found[0].deadline
-            self._stats.fail("no answer in time" if late else "the client left in the middle of the call")
+            self.stats.fail("no answer in time" if late else "the client left in the middle of the call")
 
     def _end(self, sequence: int) -> tuple[ServiceCall, float, bool] | None:
         found = self._pending.pop(sequence, None)
         if found is not None:
-            self._stats.active -= 1
+            self.stats.active -= 1
             self._outgoing.give(len(found[0].request))
         return found
 
@@ -311,7 +363,6 @@ class Serving:
         self._exports = exports
         self._budgets = budgets
         self.stats: dict[str, CallStats] = {}
-        self._servers: dict[tuple[int, int], Server] = {}
         self._pools: dict[str, ServicePool] = {}
         self._tasks = OwnedTasks()
         self._looking: asyncio.Task[None] | None = None
@@ -341,28 +392,20 @@ class Serving:
         pool, stats = self._pool(route.service, server), self.stats.setdefault(route.service, CallStats())
         budgets = self._budgets[peer]
         served = Server(session.link, number, pool, route.timeout, budgets, stats, session.time)
-        self._servers[peer, route.requests] = session.link.routes[route.requests] = served
+        session.link.routes[route.requests] = served
 
     def end_route(self, peer: int, requests: int) -> None:
         """End an open route: no more requests come, and replies of calls under way are dropped."""
-        server = self._servers.pop((peer, requests), None)
-        if server is not None:
-            server.close()
         session = self._sessions.get(peer)
-        if session is not None:
-            session.link.routes.pop(requests, None)
+        server = session.link.routes.pop(requests, None) if session is not None else None
+        if isinstance(server, Server):
+            server.close()
 
     def server_gone(self, service: str) -> None:
         """Close the connections to a server that left or was replaced."""
         pool = self._pools.pop(service, None)
         if pool is not None:
             pool.close("its server has gone")
-
-    def lane_lost(self, peer: int) -> None:
-        """Report the calls whose replies may be lost: the bulk lane's connection to a peer is gone."""
-        for (owner, _), server in list(self._servers.items()):
-            if owner == peer:
-                server.lane_lost()
 
     def close_idle(self, before: float) -> None:
         """Close the connections to servers that were not used since ``before`` (``loop.time()``).

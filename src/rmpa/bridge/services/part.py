@@ -2,15 +2,14 @@
 
 ``services.books`` decides; this part carries out what they decide. A call takes this way::
 
-    client → proxy's ServiceEndpoint → Caller ⇢ link ⇢ Server → ServicePool → server
-                                              ⇠      ⇠
+    client → proxy's ServiceEndpoint → ShownService ⇢ link ⇢ Server → ServicePool → server
+                                                    ⇠      ⇠
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
@@ -21,12 +20,12 @@ from rmpa.bridge.offers import PeerState
 from rmpa.bridge.policy import Needs, service_place
 from rmpa.bridge.services.bodies import LocalService
 from rmpa.bridge.services.books import ServiceExports, ServiceImports
-from rmpa.bridge.services.calls import Budgets, Caller, CallStats, Serving
+from rmpa.bridge.services.calls import Budgets, Server, Serving, ShownService
 from rmpa.bridge.services.direct import ServicePaths
 from rmpa.core.facts import DENIED
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
-from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.loop import yielding_to_data
 
@@ -45,38 +44,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _MISMATCH: Final = "service.mismatch"
-
-
-@dataclass(slots=True, eq=False)
-class ShownService:
-    """A peer's service in the local graph.
-
-    Args:
-        remote: The service.
-        session: The peer.
-        stats: Counts and latencies of its calls.
-        proxy: The proxy of its node; ``None`` until that exists.
-        endpoint: The endpoint that clients connect to; ``None`` until the proxy exists.
-        caller: Makes the calls while the service is open.
-        waiting: Calls that wait until the service is open.
-        asking: Requests for its types that wait until the service is open.
-        mismatch: The error that the last client with another MD5 sum got; empty if there was none.
-    """
-
-    remote: RemoteService
-    session: PeerSession
-    stats: CallStats = field(default_factory=CallStats)
-    proxy: SlaveNode | None = None
-    endpoint: ServiceEndpoint | None = None
-    caller: Caller | None = None
-    waiting: list[ServiceCall] = field(default_factory=list)
-    asking: list[asyncio.Future[ServiceDescription | str]] = field(default_factory=list)
-    mismatch: str = ""
-
-    @property
-    def text(self) -> str:
-        """The service and its peer, for texts."""
-        return f"service [{self.remote.name}] of {self.session.link.name}"
 
 
 class Services(GraphPart):
@@ -126,7 +93,7 @@ class Services(GraphPart):
             timeout, endpoint = self.context.services.timeout(shown.remote.name), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
-                if shown.caller is not None and not shown.caller.active:
+                if shown.is_open and not shown.active:
                     # The next call opens it again, with the new timeout in its request.
                     self.imports.release(shown.remote, "its timeout has changed")
 
@@ -144,7 +111,7 @@ class Services(GraphPart):
         """As of ``GraphPart``; open the services of the peer that calls wait for."""
         self._budgets[session.peer] = Budgets()
         super().link_up(session)
-        for shown in [one for one in self if one.remote.peer == session.peer and (one.waiting or one.asking)]:
+        for shown in [one for one in self if one.remote.peer == session.peer and one.wanted]:
             self._want(shown)
 
     def grace_over(self, session: PeerSession) -> bool:
@@ -193,10 +160,9 @@ class Services(GraphPart):
 
     def lane_lost(self, session: PeerSession) -> None:
         """Report calls that the loss of the bulk lane's connection may have left without an answer."""
-        for shown in list(self):
-            if shown.remote.peer == session.peer and shown.caller is not None:
-                shown.caller.lane_lost()
-        self.serving.lane_lost(session.peer)
+        for taker in list(session.link.routes.values()):
+            if isinstance(taker, ShownService | Server):
+                taker.lane_lost()
 
     def reconcile(self) -> None:
         """Register missing services again, and close routes and connections that are not used."""
@@ -204,10 +170,9 @@ class Services(GraphPart):
         services = self._core.state().services
         before = self.now() - limits.SERVICE_IDLE
         for shown in yielding_to_data(list(self)):
-            proxy, caller = shown.proxy, shown.caller
-            if proxy is not None and shown.remote.name not in services:
-                self._register(shown, proxy)
-            if caller is not None and not caller.active and caller.used_at < before:
+            if shown.proxy is not None and shown.remote.name not in services:
+                self._register(shown, shown.proxy)
+            if shown.is_open and not shown.active and shown.used_at < before:
                 self.imports.release(shown.remote, "no node calls it")
         self.serving.close_idle(before)
 
@@ -243,7 +208,7 @@ class Services(GraphPart):
             return
         proxies, owner = self.bridge.sessions.proxies(session, node, remote.origin)
         self.pass_on(remote)
-        shown = self._shown[remote] = ShownService(remote, session)
+        shown = self._shown[remote] = ShownService(remote, session, self._want)
         proxies.hold(owner, f"service {service}", lambda proxy: self._expose(shown, proxy))
         self.direct_imports.shown(remote)
 
@@ -258,7 +223,7 @@ class Services(GraphPart):
         shown.endpoint = ServiceEndpoint(
             shown.remote.name,
             proxy.name,
-            lambda call: self._call(shown, call),
+            shown.call,
             lambda: self._describe(shown),
             timeout=self.context.services.timeout(shown.remote.name),
             on_mismatch=lambda fields, text: self._mismatched(shown, fields, text),
@@ -293,7 +258,7 @@ class Services(GraphPart):
             return
         self.direct_imports.hidden(remote, end=remote.cause == DENIED)
         text = f"{shown.text}: {reason}"
-        self._fail_waiting(shown, text)
+        shown.fail_waiting(text)
         if (proxy := shown.proxy) is not None:
             self._core.call("unregisterService", proxy.name, remote.name, proxy.service_uri)
             proxy.remove_service(remote.name, text)
@@ -308,21 +273,12 @@ class Services(GraphPart):
                 shown.endpoint.description = None
             self.direct_imports.renewed(remote)
 
-    def _call(self, shown: ShownService, call: ServiceCall) -> None:
-        """Make a client's call, or have it wait until the service is open; the hot path."""
-        if shown.caller is not None:
-            shown.caller.call(call)
-            return
-        shown.waiting.append(call)
-        call.on_gone = lambda: shown.waiting.remove(call) if call in shown.waiting else None
-        self._want(shown)
-
     async def _describe(self, shown: ShownService) -> ServiceDescription | str:
         if shown.remote.about is not None:
             return shown.remote.about
-        if shown.caller is not None:  # its offer has come again since it was opened: the server may be another one
-            if shown.caller.active:
-                return shown.caller.description
+        if shown.is_open:  # its offer has come again since it was opened: the server may be another one
+            if shown.active and shown.description is not None:
+                return shown.description
             self.imports.release(shown.remote, "its type is asked for again")
         answer: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
         shown.asking.append(answer)
@@ -333,51 +289,27 @@ class Services(GraphPart):
         """Open a service, unless its peer has no link now: then the next ``link_up``, or ``gone``, ends the wait."""
         remote, session = shown.remote, shown.session
         if not remote.shown:
-            self._fail_waiting(shown, f"{shown.text} has just gone")
+            shown.fail_waiting(f"{shown.text} has just gone")
         elif session.state is PeerState.AWAY:
-            text = f"service [{remote.name}]: the agent of {session.link.name} has crashed, only direct calls work"
-            self._fail_waiting(shown, text)
+            crashed = f"the agent of {session.link.name} has crashed, only direct calls work"
+            shown.fail_waiting(f"service [{remote.name}]: {crashed}")
         elif session.linked:
             self.imports.want(remote, self.now())
 
     def opened(self, remote: RemoteService) -> None:
         """A service can be called: requests go out on ``remote.requests``, replies come in on ``remote.route``."""
         shown = self._shown.get(remote)
-        if shown is None or not shown.session.linked or remote.about is None:
-            return
-        session, budgets = shown.session, self._budgets[remote.peer]
-        caller = Caller(session.link, remote.requests, shown.text, budgets, shown.stats, remote.about)
-        shown.caller = session.link.routes[remote.route] = caller
-        asking, shown.asking = shown.asking, []
-        for future in asking:
-            if not future.done():
-                future.set_result(remote.about)
-        waiting, shown.waiting = shown.waiting, []
-        for call in waiting:
-            caller.call(call)
+        if shown is not None and shown.session.linked and remote.about is not None:
+            shown.session.link.routes[remote.route] = shown
+            shown.open(remote.about, self._budgets[remote.peer])
 
     def ended(self, remote: RemoteService, route: int, reason: str) -> None:
         """A service cannot be called, or no longer: its calls fail with the reason; ``route`` was that of replies."""
         session = self.bridge.sessions.get(remote.peer)
         if session is not None:
             session.link.routes.pop(route, None)
-        if (shown := self._shown.get(remote)) is None:
-            return
-        if shown.caller is not None:
-            shown.caller.close(reason)
-            shown.caller = None
-        self._fail_waiting(shown, f"{shown.text}: {reason}")
-
-    def _fail_waiting(self, shown: ShownService, text: str) -> None:
-        asking, shown.asking = shown.asking, []
-        for future in asking:
-            if not future.done():
-                future.set_result(text)
-        waiting, shown.waiting = shown.waiting, []
-        for call in waiting:
-            shown.stats.calls += 1
-            shown.stats.fail(text)
-            call.fail(text)
+        if (shown := self._shown.get(remote)) is not None:
+            shown.close(reason)
 
     def _mismatched(self, shown: ShownService, fields: Mapping[str, str], text: str) -> None:
         """Report a client that was refused for its MD5 sum, here and at the peer."""

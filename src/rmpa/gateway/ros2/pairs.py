@@ -21,7 +21,7 @@ import yaml
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import TypesysError
 
-from rmpa.config.writers import check_writers
+from rmpa.config.toml_file import check_writers
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
