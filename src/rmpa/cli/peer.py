@@ -18,9 +18,8 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.peers import PENDING
 from rmpa.observe.sites import SitesReport
-from rmpa.observe.snapshot import ModuleFacts, PingReply
+from rmpa.observe.snapshot import PENDING, ModuleFacts, PingReply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

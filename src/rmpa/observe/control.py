@@ -136,7 +136,7 @@ class ControlRequest(_Line, frozen=True, omit_defaults=True):
     """A client's request.
 
     Attributes:
-        op: The name of an operation (``observe.operations.REPLIES``).
+        op: The name of an operation (``observe.operations``).
         args: Its arguments, by name.
         follows: Bytes of the argument ``text`` that follow the line.
     """

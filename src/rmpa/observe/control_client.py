@@ -246,7 +246,7 @@ class ControlClient:
         """Send a request, and wait for the reply.
 
         Args:
-            op: The name of the operation (``observe.operations.REPLIES``).
+            op: The name of the operation (``observe.operations``).
             type: The type of its value.
             args: Its arguments.
 
@@ -264,6 +264,18 @@ class ControlClient:
         if reply.follows:
             with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
         return reply.value
+
+    def pass_on(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
+        """As ``call``, of a question that this agent passes on to another one.
+
+        Raises:
+            RmpaError: That one refuses; the text is its own, and has its name.
+        """
+        try:
+            return self.call(op, type, **args)
+        except PeerRefused as error:
+            text = f"{error.reason}; {error.remedy}" if error.remedy else error.reason
+            raise RmpaError(text, code=error.code) from None
 
     async def ask(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
         """As ``call``, in a thread; if it is cancelled, the connection ends."""
