@@ -14,17 +14,6 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.machine import (
-    UNIT_FOLDER,
-    Machine,
-    check_machine,
-    copy_state,
-    entries,
-    modules_in,
-    own_program,
-    refused,
-    remove_folder,
-)
 from rmpa.cli.options import Options, flag, json_verb
 from rmpa.cli.output import confirm
 from rmpa.cli.units import (
@@ -34,10 +23,19 @@ from rmpa.cli.units import (
     PACKAGED,
     RUNTIME,
     STATE,
+    UNIT_FOLDER,
     UNITS,
     USER,
+    Machine,
+    check_machine,
     config_text,
+    copy_state,
     drop_in_text,
+    entries,
+    modules_in,
+    own_program,
+    refused,
+    remove_folder,
     unit_texts,
 )
 from rmpa.config.module_name import (
@@ -74,6 +72,14 @@ _PROPERTIES: Final = (
 _AWAY: Final = ("inactive", "unknown")
 # Lines of a unit's log that are shown.
 _LOG_LINES: Final = 5
+# The accounts of the units, in the order in which they are made, with the words of ``groupadd`` and ``useradd``.
+_ACCOUNTS: Final = (
+    ("group", GROUP, ("--system", GROUP)),
+    (
+        *("user", USER),
+        ("--system", "--gid", GROUP, "--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin", USER),
+    ),
+)
 # A user without any rights of its own: what it cannot run, the unit's user cannot either.
 _NOBODY: Final = 65534
 
@@ -196,7 +202,7 @@ def service_install(
         raise ConfigError("--name", problem)
     program = own_program()
     before = former(os.environ, root)
-    packaged = program == PACKAGED and machine.packaged
+    packaged = program == PACKAGED and machine.has_packaged()
     if packaged and user:
         raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
     wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
@@ -210,8 +216,8 @@ def service_install(
     if user is None:
         user = USER if root or packaged else choose_user(program)
         if user != USER:
-            machine.note(f"the units run as {user}: no other user can run {program}")
-    _make_user(machine, user)
+            machine.tell(f"the units run as {user}: no other user can run {program}")
+    _make_accounts(machine, user)
     _make_config(machine, before)
     renamed = _take_over(machine, before, user, name)
     # Units that were made for another program would hide the package's.
@@ -223,7 +229,7 @@ def service_install(
         changed.extend(wanted)
     _start(machine, wanted, changed)
     if not (dry_run or root):
-        machine.note("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
+        machine.tell("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
     options.show({"units": wanted, "user": user, "changes": machine.changes, "dry_run": dry_run})
     return 0
 
@@ -278,27 +284,23 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
         problem = f"{holder} has port {settings.core_port}, which the agent's core needs"
         if not machine.dry:
             raise refused("install", problem, "end it first")
-        machine.note(f"! {problem}: end it first")
+        machine.tell(f"! {problem}: end it first")
 
 
-def _make_user(machine: Machine, user: str) -> None:
-    below = ["--prefix", machine.root] if machine.root else []
-    if machine.number("group", GROUP) is None:
-        machine.run(f"make the group {GROUP}", "groupadd", *below, "--system", GROUP)
-    if user != USER:
-        if not machine.root and machine.number("passwd", user) is None:
-            raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
-        return
-    if machine.ids(user) is None:
-        home = ["--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin"]
-        machine.run(f"make the user {user}", "useradd", *below, "--system", "--gid", GROUP, *home, user)
+def _make_accounts(machine: Machine, user: str) -> None:
+    for kind, name, words in _ACCOUNTS:
+        if kind == "user" and user != USER:
+            if not machine.root and machine.number(kind, user) is None:
+                raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
+        elif machine.number(kind, name) is None:
+            machine.run(f"make the {kind} {name}", f"{kind}add", *words)
 
 
 def _make_config(machine: Machine, before: Former) -> None:
     if machine.path(CONFIG).exists():
-        machine.note(f"{CONFIG} stays as it is")
+        machine.tell(f"{CONFIG} stays as it is")
         if before.config is not None:
-            machine.note(f"! {before.config} is not read by the units")
+            machine.tell(f"! {before.config} is not read by the units")
         return
     text, source = config_text(), "every setting in a comment"
     if before.config is not None:
@@ -319,12 +321,12 @@ def _take_over(machine: Machine, before: Former, user: str, name: str | None) ->
     kept = kept_name(place)
     ids = None if machine.dry or os.geteuid() else machine.ids(user)
     if entries(place):
-        machine.note(f"{STATE} stays as it is")
+        machine.tell(f"{STATE} stays as it is")
     elif before.state is not None:
         module = name or kept_name(before.state) or before.name or peer_name_from(socket.gethostname())
         ours, others = modules_in(before.state, module, insecure=before.settings.trust.insecure)
         if others:
-            machine.note(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
+            machine.tell(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
         if ours or not others:
             kept = kept_name(before.state)
             what = ", ".join([*([f"the name {kept}"] if kept else []), *ours.values()])
@@ -346,7 +348,7 @@ def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: st
     """Write the units; return those whose text has changed. One that was written by hand is renamed, not replaced."""
     texts = unit_texts(program, user)
     for unit in wanted:
-        path = machine.path(f"{UNIT_FOLDER}/{unit}")
+        path = machine.unit(unit)
         old = f"{unit}{_BY_HAND}"
         if path.is_file() and not _is_made(path) and machine.change(f"rename {UNIT_FOLDER}/{unit} to {old}"):
             path.rename(path.with_name(old))
@@ -367,7 +369,7 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
     for unit in wanted:
         now = _shown(unit)
         if now.get("ActiveState") == "active" and now.get("UnitFileState") == "enabled" and unit not in changed:
-            machine.note(f"{unit} runs")
+            machine.tell(f"{unit} runs")
             continue
         again = now.get("ActiveState") == "active"
         try:
@@ -517,31 +519,31 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
     """
     machine = _machine("uninstall", root, options, dry=dry_run)
     root = machine.root
-    if purge and machine.packaged:
+    if purge and machine.has_packaged():
         raise refused("uninstall", "the package has settings and state", "sudo apt purge rmpa")
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
         raise ConfigError("rmpa service uninstall", "nothing was removed", code="not-confirmed")
-    units = ((unit, machine.path(f"{UNIT_FOLDER}/{unit}")) for unit in UNITS.values())
+    units = ((unit, machine.unit(unit)) for unit in UNITS.values())
     # One that was written by hand stays.
     parts = [unit for unit, path in units if (_is_made(path) if path.is_file() else machine.has_packaged(unit))]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)
     removed = _remove_made(machine, (*UNITS.values(), *DROP_INS.values()))
     for unit in removed:
-        old = machine.path(f"{UNIT_FOLDER}/{unit}{_BY_HAND}")
+        old = machine.unit(f"{unit}{_BY_HAND}")
         if old.is_file() and machine.change(f"rename {UNIT_FOLDER}/{old.name} to {unit}"):
             old.rename(old.with_name(unit))
     if removed and not root:
         machine.systemctl("daemon-reload")
     if purge:
         _purge(machine)
-    elif not machine.packaged:
+    elif not machine.has_packaged():
         stays = [each for each in (CONFIG, STATE) if machine.path(each).exists()]
         stays += [f"the user {USER}"] if machine.ids(USER) is not None else []
         if stays:
-            machine.note(f"{', '.join(stays)} stay; they go by: rmpa service uninstall --purge")
+            machine.tell(f"{', '.join(stays)} stay; they go by: rmpa service uninstall --purge")
     if not machine.changes:
-        machine.note("nothing is installed")
+        machine.tell("nothing is installed")
     options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})
     return 0
 
@@ -555,7 +557,7 @@ def _remove_made(machine: Machine, places: Iterable[str]) -> list[str]:
     """Remove those of some files in the folder of units that ``install`` has made; return which."""
     found = []
     for place in places:
-        path = machine.path(f"{UNIT_FOLDER}/{place}")
+        path = machine.unit(place)
         if path.is_file() and _is_made(path):
             found.append(place)
             if machine.change(f"remove {UNIT_FOLDER}/{place}"):
@@ -574,8 +576,6 @@ def _purge(machine: Machine) -> None:
     for place in (state, machine.path(RUNTIME)):
         if place.is_dir() and machine.change(f"remove {str(place).removeprefix(machine.root)}"):
             remove_folder(place, machine.root)
-    below = ["--prefix", machine.root] if machine.root else []
-    if machine.ids(USER) is not None:
-        machine.run(f"remove the user {USER}", "userdel", *below, USER)
-    if machine.number("group", GROUP) is not None:
-        machine.run(f"remove the group {GROUP}", "groupdel", *below, GROUP)
+    for kind, name, _ in reversed(_ACCOUNTS):
+        if machine.number(kind, name) is not None:
+            machine.run(f"remove the {kind} {name}", f"{kind}del", name)

@@ -8,17 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
-import msgspec
 
-from rmpa.cli.completion import nodes
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, unknown_name, with_node
+from rmpa.cli.graph import GraphName, look_at_node, read_graph, read_name, unknown_name, with_node
 from rmpa.cli.main import verb
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb
+from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes
 from rmpa.cli.output import printable
-from rmpa.core.errors import RmpaError, StartError
+from rmpa.core.errors import StartError
 from rmpa.core.identity import proxied_node
-from rmpa.ros.core.liveness import ping_node
-from rmpa.ros.environment import NodeFacts, describe_node
 from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
@@ -165,7 +161,8 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
     name = next((each for each in graph.nodes if _is(wanted, each)), None)
     if name is None:
         raise unknown_name("node", str(wanted), graph.nodes)
-    facts = await _facts(graph, master.uri, name)
+    reply = await call_api(master.uri, "lookupNode", _CALLER_ID, name)
+    facts = await look_at_node(graph, name, str(reply.value) if reply.code == 1 else "")
     ends = [t.removesuffix(live.DESCRIPTIONS) for t in facts.publications if t.endswith(live.DESCRIPTIONS)]
     server = name if name in ends else min(ends, key=len, default="")
     measured = [t for t in facts.publications if not t.endswith((live.DESCRIPTIONS, live.UPDATES, "/rosout"))]
@@ -190,16 +187,3 @@ def _is(wanted: GraphName, node: str) -> bool:
     if wanted.peer is None:
         return node == wanted.name
     return proxy is not None and wanted.matches(node) and proxy[1] == wanted.name
-
-
-async def _facts(graph: Graph, master_uri: str, name: str) -> NodeFacts:
-    """The registrations of a node, and the process id of one that answers on this machine."""
-    reply = await call_api(master_uri, "lookupNode", _CALLER_ID, name)
-    uri = str(reply.value) if reply.code == 1 else ""
-    facts = describe_node(name, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
-    if proxied_node(name) is not None:
-        return facts
-    try:
-        return msgspec.structs.replace(facts, pid=(await ping_node(name, uri, _CALLER_ID)).pid)
-    except RmpaError as error:
-        return msgspec.structs.replace(facts, problem=str(error))

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import peers
 from rmpa.cli.graph import find_peer, origin_text, read_graph, run_stream, with_node
-from rmpa.cli.options import Options, argument, flag, graph_verb, summary
+from rmpa.cli.options import Options, argument, flag, graph_verb, peers, summary
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer

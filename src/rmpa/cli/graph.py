@@ -15,7 +15,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name, is_meant, proxied_node, proxied_peer
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.limits import CONTROL_CALL_TIMEOUT
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.core.facts import RouteInfo
-    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
+    from rmpa.ros.environment import NodeFacts
     from rmpa.ros.node.node import Node, Received
 
 # Seconds between two lines of figures, as rostopic has it.
@@ -71,10 +72,19 @@ class Master:
             services: Only these are in it; ``True``: all; ``None``: all if all topics are in it, else none.
             peers: Whether peers are in it.
         """
-        if self.agent is not None:
-            with contextlib.suppress(RmpaError), ControlClient(self.agent) as client:
-                return client.call("snapshot", Snapshot, topics=topics, services=services, peers=peers)
+        with contextlib.suppress(RmpaError), self.client() as client:
+            return client.snapshot(topics=topics, services=services, peers=peers)
         return None
+
+    def client(self, timeout: float = CONTROL_CALL_TIMEOUT) -> ControlClient:
+        """A connection to the master's agent.
+
+        Raises:
+            UnreachableError: This is not an agent's core, or its agent does not answer.
+        """
+        if self.agent is None:
+            raise self.no_agent()
+        return ControlClient(self.agent, timeout)
 
 
 def choose_master(master: str | None, agent: str | None, environ: Mapping[str, str]) -> Master:
@@ -338,6 +348,26 @@ async def read_graph(master: Master) -> Graph:
         raise RmpaError(problem, code="protocol-error") from None
     names = [{name: sorted(nodes) for name, nodes in table} for table in (publishers, subscribers, services)]
     return Graph(names[0], names[1], known, names[2])
+
+
+async def look_at_node(graph: Graph, node: str, uri: str) -> NodeFacts:
+    """The registrations of a node, and its process id, or why it does not answer; a proxy is not asked.
+
+    Args:
+        graph: Has the node.
+        node: Its name.
+        uri: Its slave API.
+    """
+    from rmpa.ros.core.liveness import ping_node
+    from rmpa.ros.environment import describe_node
+
+    facts = describe_node(node, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
+    if proxied_node(node) is not None:
+        return facts
+    try:
+        return msgspec.structs.replace(facts, pid=(await ping_node(node, uri, "/rmpa_node")).pid)
+    except RmpaError as error:
+        return msgspec.structs.replace(facts, problem=str(error))
 
 
 class Enough(Exception):  # noqa: N818 - not an error

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from rmpa.cli.options import Options, flag, json_verb
-from rmpa.cli.output import Table, print_text, printable, warn
-from rmpa.cli.redact import without_passwords
+from rmpa.cli.output import Table, print_text, printable, warn, without_passwords
 from rmpa.cli.units import CONFIG, config_text
 from rmpa.config.module_name import kept_name, of_unit, state_dir
 from rmpa.config.read import FILE_NAME, find_config_file, parse_config, ros_layer

@@ -12,9 +12,8 @@ import msgspec
 
 from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.limits import LAUNCH_LOG_LINES
-from rmpa.cli.completion import ANSWER, peers
 from rmpa.cli.graph import suggestion
-from rmpa.cli.options import FiniteRange, Options, agent_verb, argument, flag
+from rmpa.cli.options import ANSWER, FiniteRange, Options, agent_verb, argument, flag, options_of, peers
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe.limits import CONTROL_HANDLER_TIMEOUT
@@ -41,11 +40,7 @@ _CLEAR: Final = "\x1b[H\x1b[2J"
 
 def _launchable(ctx: click.Context, _: str) -> Iterable[str]:
     """What can be started, for a shell's completion."""
-    import os
-
-    from rmpa.observe.control_client import ControlClient, choose_agent
-
-    with ControlClient(choose_agent(os.environ, ctx.params.get("agent")).path, ANSWER) as client:
+    with options_of(ctx).client(ANSWER) as client:
         own = client.agent().name
         for module in client.call("launch", tuple[ModuleResources, ...], what="list"):
             for each in module.resources:

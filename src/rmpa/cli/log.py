@@ -15,8 +15,7 @@ import click
 
 from rmpa.bridge.limits import LOG_LINES_ASKED
 from rmpa.bridge.log_ring import LEVELS, ModuleLog
-from rmpa.cli.completion import completes, nodes, peers
-from rmpa.cli.options import LINES, Options, agent_verb, argument, flag
+from rmpa.cli.options import LINES, Options, agent_verb, argument, completes, flag, nodes, peers
 from rmpa.cli.output import Painted, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import ConfigError
 

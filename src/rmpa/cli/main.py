@@ -133,7 +133,7 @@ _DECLARED: Final = {
     "config show": ("agent", "Print each setting that `rmpa up` would use here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
-    "completion": ("completion", "Print the script that completes rmpa's commands in a shell."),
+    "completion": ("program", "Print the script that completes rmpa's commands in a shell."),
 }
 _FAMILIES: Final = {file.removesuffix(".py") for file in os.listdir(os.path.dirname(__file__))}  # noqa: PTH208, PTH120
 _OWN: Final = {words for words, (module, _) in _DECLARED.items() if module in _FAMILIES and module != "main"}
@@ -142,14 +142,6 @@ VERBS: Final = {
     words: about
     for words, about in _DECLARED.items()
     if words in _OWN or any(each.startswith(f"{words} ") for each in _OWN)
-}
-# What to use in place of a command that is gone, by its words behind ``rmpa``.
-REMOVED_VERBS: Final = {
-    "experiment": "in a clone: make experiment, or python -m lab experiment (docs/compare/experiments.md)",
-    "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
-    "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
-    "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
-    "trust import": "write [[permission]] tables into rmpa.toml: docs/guides/trust.md#permissions",
 }
 # Words that are no commands of ``rmpa``, and what a user who writes them wants.
 MEANT: Final = {
@@ -320,19 +312,13 @@ class LazyGroup(PlacedHelp, click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command; for a misspelt one the error names the nearest."""
-        if args and args[0] not in self.commands_at and args[0] not in self._plugins():
-            words = " ".join((*ctx.command_path.split()[1:], args[0]))
-            if remedy := REMOVED_VERBS.get(words):
-                raise ConfigError(f"rmpa {words}", "is not a command any more", remedy, code="removed")
-            if not args[0].startswith("-"):
-                near = did_you_mean(args[0], self.commands_at)
-                meant = (
-                    () if self._path else [each for each in MEANT.get(args[0], ()) if each in VERBS or each[0] == "-"]
-                )
-                others = meant or ([near] if near else [])
-                named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
-                hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
-                ctx.fail(f"No such command {args[0]!r}. {hint}")
+        word = args[0] if args else "-"
+        if word not in self.commands_at and not word.startswith("-") and word not in self._plugins():
+            near, meant = did_you_mean(word, self.commands_at), () if self._path else MEANT.get(word, ())
+            others = [each for each in meant if each in VERBS or each[0] == "-"] or ([near] if near else [])
+            named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
+            hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
+            ctx.fail(f"No such command {word!r}. {hint}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
@@ -490,14 +476,14 @@ def _show_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if as_json and not wanted:
         raise click.NoSuchOption("--json", ctx=ctx)
     if wanted:
-        from rmpa.cli import version
+        from rmpa.cli import program
 
         if as_json:
             from rmpa.cli.output import print_json
 
-            print_json(version.about())
+            print_json(program.about())
         else:
-            click.echo(f"rmpa {version.long_version()}")
+            click.echo(f"rmpa {program.long_version()}")
         ctx.exit()
 
 
@@ -554,11 +540,6 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         done = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
-        if isinstance(error, click.NoSuchOption):
-            from rmpa.config.schema import REMOVED
-
-            if remedy := REMOVED.get(error.option_name):
-                error = click.UsageError(f"No such option: {error.option_name}; {remedy}", error.ctx)
         text, code, status = error.format_message(), "usage", error.exit_code
         if isinstance(error, click.exceptions.NoArgsIsHelpError):
             click.echo(text, err=True)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import topics
 from rmpa.cli.graph import (
     Enough,
     read_graph,
@@ -24,9 +23,8 @@ from rmpa.cli.graph import (
     watch_topic,
     with_node,
 )
-from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb
-from rmpa.cli.output import print_json, print_text, warn
-from rmpa.cli.values import fill_stamps, flatten, pick, read_values, shorten, to_text
+from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, topics
+from rmpa.cli.output import fill_stamps, flatten, pick, print_json, print_text, read_values, shorten, to_text, warn
 from rmpa.core.errors import ConfigError, UnreachableError
 from rmpa.core.identity import proxied_node
 

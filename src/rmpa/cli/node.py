@@ -7,19 +7,26 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from msgspec.structs import replace
-
-from rmpa.cli.completion import nodes
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, unknown_name
-from rmpa.cli.options import Options, Selection, argument, flag, graph_verb, ping_options, selection_options, summary
+from rmpa.cli.graph import Graph, GraphName, look_at_node, read_graph, read_name, require_peer, unknown_name
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    argument,
+    flag,
+    graph_verb,
+    nodes,
+    ping_options,
+    pings,
+    selection_options,
+    summary,
+)
 from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import is_own, proxied_node, proxied_peer
-from rmpa.observe import limits as observe_limits
-from rmpa.observe.control_client import ControlClient
+from rmpa.observe.limits import CONTROL_HANDLER_TIMEOUT
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.liveness import end_node, ping_node
-from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
+from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
 from rmpa.ros.node.loggers import read_levels, set_level
@@ -69,35 +76,15 @@ def _module_of(master: Master) -> str | None:
     return snapshot.agent.name if snapshot is not None else None
 
 
-def _ask(master: Master, kind: type[_T], what: str, peer: str | None, **args: str) -> _T:
-    """Ask the agents of other modules about their nodes, through the agent of this module.
-
-    Args:
-        master: This module's.
-        kind: The type of the answer.
-        what: ``node.list``, ``node.info``, ``node.ping`` or ``node.kill``.
-        peer: The peer; ``None``: all.
-        args: The node.
+def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T:
+    """Ask the agent of a node's module about the node, through the agent of this module.
 
     Raises:
         UnreachableError: This master is not an agent's core.
-        PeerRefused: There is no such peer, it does not answer, or it refuses.
+        RmpaError: There is no such peer, it does not answer, or it refuses; in its own words.
     """
-    if master.agent is None:
-        raise master.no_agent()
-    with ControlClient(master.agent, timeout=observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
-        return client.call("node", kind, what=what, peer=peer, **args)
-
-
-def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T:
-    """Ask the agent of a node's module about the node; errors are in its own words."""
-    try:
-        return _ask(master, kind, what, wanted.peer, node=wanted.name)
-    except PeerRefused as error:
-        # The peer's agent refuses, not this one; its name is in the text.
-        raise RmpaError(
-            f"{error.reason}; {error.remedy}" if error.remedy else error.reason, code=error.code
-        ) from None
+    with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+        return client.pass_on("node", kind, what=what, peer=wanted.peer, node=wanted.name)
 
 
 def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
@@ -127,7 +114,8 @@ def _of_peers(master: Master, graph: Graph, peer: str | None) -> list[_Line]:
         return shown
     told: tuple[PeerNodes, ...] = ()
     try:
-        told = _ask(master, tuple[PeerNodes, ...], "node.list", peer)
+        with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+            told = client.call("node", tuple[PeerNodes, ...], what="node.list", peer=peer)
     except PeerRefused:
         if peer is None or not shown:
             raise
@@ -177,13 +165,10 @@ def node_ping(node: str, count: int | None, interval: float, everything: bool, o
         answers = [_ping(master, one, 1, options) for one in found]
         return 0 if all(answers) else 1
     require_peer(master, Graph(), found[0])
-    answered = sent = 0
+    answered = False
     with contextlib.suppress(KeyboardInterrupt):
-        while count is None or sent < count:
-            if sent:
-                time.sleep(interval)
-            sent += 1
-            answered += _ping(master, found[0], sent, options)
+        for number in pings(count, interval):
+            answered |= _ping(master, found[0], number, options)
     return 0 if answered else 1
 
 
@@ -349,12 +334,7 @@ def node_info(node: str, options: Options) -> None:
 
     async def here() -> NodeFacts:
         graph = await read_graph(master)
-        uri = await _find_uri(master, graph, wanted.name)
-        facts = describe_node(wanted.name, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
-        try:
-            return replace(facts, pid=(await ping_node(wanted.name, uri, _CALLER_ID)).pid)
-        except RmpaError as error:
-            return replace(facts, problem=str(error))
+        return await look_at_node(graph, wanted.name, await _find_uri(master, graph, wanted.name))
 
     facts = _ask_peer(master, wanted, "node.info", NodeFacts) if wanted.peer is not None else asyncio.run(here())
     module = wanted.peer or _module_of(master)
@@ -372,10 +352,10 @@ def node_info(node: str, options: Options) -> None:
         if facts.problem:
             warn(facts.problem, "node-unreachable")
 
-    about: dict[str, object] = {"name": facts.name, "peer": wanted.peer, "module": module}
-    about |= {"uri": facts.uri, "pid": facts.pid, "reachable": not facts.problem, "problem": facts.problem or None}
-    about |= {"publications": facts.publications, "subscriptions": facts.subscriptions}
-    options.show(about | {"services": facts.services}, text())
+    about = {"name": facts.name, "peer": wanted.peer, "module": module, "uri": facts.uri, "pid": facts.pid}
+    reached = {"reachable": not facts.problem, "problem": facts.problem or None}
+    ends = {"publications": facts.publications, "subscriptions": facts.subscriptions, "services": facts.services}
+    options.show({**about, **reached, **ends}, text())
 
 
 @graph_verb(argument("node", nodes), argument("logger", default=""), argument("level", default=""))
@@ -402,7 +382,9 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
     if level and level not in LEVELS:
         raise ConfigError("LEVEL", f"{level!r} is not a level", f"use one of {', '.join(LEVELS)}")
     if wanted.peer is not None:
-        levels = _levels_of_peer(master, wanted, logger, level)
+        with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+            args = {"peer": wanted.peer, "node": wanted.name, "logger": logger, "level": level}
+            levels = client.pass_on("log_level", dict[str, str], **args)
     else:
         levels = asyncio.run(_levels(master, wanted.name, logger, level))
     about = {"node": wanted.name, "peer": wanted.peer, "loggers": levels}
@@ -422,14 +404,3 @@ async def _levels(master: Master, node: str, logger: str, level: str) -> dict[st
     if level:
         return await set_level(reply.value, node, _CALLER_ID, logger, level)
     return await read_levels(reply.value, api, node, _CALLER_ID)
-
-
-def _levels_of_peer(master: Master, wanted: GraphName, logger: str, level: str) -> dict[str, str]:
-    if master.agent is None:
-        raise master.no_agent()
-    with ControlClient(master.agent, timeout=observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
-        try:
-            args = {"peer": wanted.peer, "node": wanted.name, "logger": logger, "level": level}
-            return client.call("log_level", dict[str, str], **args)
-        except PeerRefused as error:
-            raise RmpaError(error.reason, code=error.code) from None

@@ -1,26 +1,27 @@
-"""How a verb is declared: its docstring, its own arguments, and the options that verbs share."""
+"""How a verb is declared: its own arguments, what a shell completes of them, and the options that verbs share."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 import sys
+import time
 from collections import Counter
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import click
 
-from rmpa.cli.completion import agents, completes
 from rmpa.cli.main import decorated, verb
 from rmpa.config.settings import SETTINGS
+from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from rmpa.cli.completion import Find
     from rmpa.cli.graph import Graph, Master
     from rmpa.cli.output import Text
     from rmpa.config.schema import Setting
@@ -30,6 +31,101 @@ _T = TypeVar("_T")
 _Function = TypeVar("_Function", bound="Callable[..., Any]")
 # Lines of a long list that a terminal shows.
 LINES: Final = 100
+# Finds names, for the command line so far and the begun word.
+Find: TypeAlias = "Callable[[click.Context, str], Iterable[str]]"
+# Seconds that the agent or master has for its answer: a person waits with the key pressed.
+ANSWER: Final = 0.3
+
+
+def completes(find: Find, *modules: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """A function for ``shell_complete`` of an argument or option: the names that begin as a user began to write.
+
+    There are none where no agent or master answers in time.
+
+    Args:
+        find: Finds the names.
+        modules: What it imports: the time that this takes is not the agent's.
+    """
+
+    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+        import contextlib
+        import importlib
+        import threading
+
+        found: set[str] = set()
+
+        def ask() -> None:
+            with contextlib.suppress(RmpaError, OSError, ValueError):
+                found.update(name for name in find(ctx, incomplete) if name.startswith(incomplete))
+
+        for module in ("asyncio", "rmpa.cli.graph", "rmpa.ros.http.rpc", *modules):
+            importlib.import_module(module)
+        # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
+        asked = threading.Thread(target=ask, daemon=True)
+        asked.start()
+        asked.join(ANSWER)
+        return sorted(found)
+
+    return complete
+
+
+def options_of(ctx: click.Context) -> Options:
+    """The shared options of a command line so far."""
+    return Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
+
+
+def graph_of(ctx: click.Context) -> Graph:
+    """The graph of the master that a command line means."""
+    return options_of(ctx).graph()[1]
+
+
+def of_peer(name: str, node: str) -> str:
+    """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
+    from rmpa.core.identity import proxied_peer
+
+    peer = proxied_peer(node)
+    return name if peer is None else f"{peer}:{name}"
+
+
+def _with_peers(found: dict[str, list[str]], incomplete: str) -> Iterable[str]:
+    """Names, of this module and of its peers; ``PEER:/name`` too, unless a name without peer has been begun."""
+    for name, nodes in found.items():
+        yield name
+        if not incomplete.startswith("/"):
+            yield from (of_peer(name, node) for node in nodes)
+
+
+def agents(_: click.Context, __: str) -> Iterable[str]:
+    """Agents of this machine."""
+    from rmpa.observe.control_client import find_agents
+
+    return [agent.name for agent in find_agents(os.environ)]
+
+
+def peers(ctx: click.Context, _: str) -> Iterable[str]:
+    """Modules that the agent knows."""
+    with options_of(ctx).client(ANSWER) as client:
+        return [peer.name for peer in client.snapshot(topics=()).peers]
+
+
+def topics(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Topics of the graph."""
+    graph = graph_of(ctx)
+    return _with_peers(graph.subscribers | graph.publishers, incomplete)
+
+
+def services(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Services of the graph."""
+    return _with_peers(graph_of(ctx).services, incomplete)
+
+
+def nodes(ctx: click.Context, _: str) -> Iterable[str]:
+    """Nodes of the graph."""
+    from rmpa.core.identity import proxied_node
+
+    for node in graph_of(ctx).nodes:
+        proxy = proxied_node(node)
+        yield node if proxy is None else of_peer(proxy[1], node)
 
 
 def json_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
@@ -98,6 +194,14 @@ def ping_options(function: _Function) -> _Function:
     every = click.option("-i", "--interval", type=seconds, default=1.0, show_default=True, help="Seconds between.")
     count = click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
     return count(every(function))
+
+
+def pings(count: int | None, interval: float) -> Iterator[int]:
+    """The numbers of pings, so many seconds apart; ``count``: as many as that, else without an end."""
+    for number in itertools.count(1) if count is None else range(1, count + 1):
+        if number > 1:
+            time.sleep(interval)
+        yield number
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,9 +18,8 @@ import click
 import yaml
 
 from rmpa.bridge.params.transfer import key_problem
-from rmpa.cli.completion import completes, peers
 from rmpa.cli.graph import suggestion
-from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb
+from rmpa.cli.options import Options, agent_verb, argument, completes, flag, graph_verb, options_of, peers
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
@@ -55,8 +54,7 @@ def param_names(ctx: click.Context, incomplete: str) -> Iterable[str]:
     """Parameters, and namespaces of them, for ``completion.completes``."""
     before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
     peer, _ = split_peer(ctx.params.get("peer"), incomplete)
-    options = Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
-    for name in open_store(peer, options).names():
+    for name in open_store(peer, options_of(ctx)).names():
         yield from (before + each for each in with_namespaces(name))  # rosparam's verbs take namespaces too
 
 
@@ -73,11 +71,6 @@ class MasterParams:
     """The parameters of a ROS master, an agent's core or any other; as ``PeerParams``."""
 
     master: Master
-
-    @property
-    def title(self) -> str:
-        """The master, for error texts."""
-        return self.master.uri
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or a namespace.
@@ -101,7 +94,7 @@ class MasterParams:
         for name, one in parameters:
             reply = self._call("setParam", name, one)
             if reply.code != 1:
-                raise RmpaError(f"{self.title} does not set {name}: {reply.status}", code="refused")
+                raise RmpaError(f"{self.master.uri} does not set {name}: {reply.status}", code="refused")
         return len(parameters)
 
     def delete(self, key: str) -> None:
@@ -116,7 +109,7 @@ class MasterParams:
         reply = self._call(method, key)
         if reply.code != 1:
             known = {name for full in self.names() for name in with_namespaces(full)}
-            problem = f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}"
+            problem = f"{self.master.uri} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}"
             raise RmpaError(problem, code="unknown-name")
         return reply
 

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import click
 import msgspec
 
-from rmpa.cli.completion import peers
 from rmpa.cli.graph import find_peer, shown_state, suggestion
-from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    agent_verb,
+    argument,
+    flag,
+    limit_options,
+    peers,
+    ping_options,
+    pings,
+    summary,
+)
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
 from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.sites import SitesReport
+from rmpa.observe.sites import REPORT, SITE_INFO, SitesReport
 from rmpa.observe.snapshot import PENDING, ModuleFacts, PingReply
 
 if TYPE_CHECKING:
@@ -267,10 +276,7 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
     with options.client() as client:
         found = find_peer(client.snapshot(topics=()), name)
         with contextlib.suppress(KeyboardInterrupt):
-            while count is None or sent < count:
-                if sent:
-                    time.sleep(interval)
-                sent += 1
+            for sent in pings(count, interval):
                 _ping_once(client, found, sent, times, options)
     of = SampleSpread.of(times)
     figures = {"min": of.min, "avg": of.mean, "max": of.max, "sd": of.sd}
@@ -307,11 +313,7 @@ def _connect(options: Options, name: str | None) -> ControlClient:
 
 def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
     try:
-        value: object = client.call("site", object, what=what, args=args)
-    except PeerRefused as error:
-        raise RmpaError(error.reason, code=error.code) from None  # the agent only passes on what a gateway says
-    try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(client.pass_on("site", object, what=what, args=args), kind)
     except msgspec.ValidationError as error:
         raise RemoteProtocolError(f"the gateway answers in another way: {error}; is it another version?") from None
 
@@ -331,8 +333,6 @@ def site_list(name: str | None, options: Options) -> int:
       rmpa site list --name store-gateway
       rmpa site list --json | jq -r '.[].sites[].name'
     """
-    from rmpa.observe.sites import REPORT
-
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
         if not reports:
@@ -386,8 +386,6 @@ def site_info(site: str, name: str | None, options: Options) -> int:
       rmpa site info warehouse
       rmpa site info hall --json | jq '.sites[0].sources[] | select(.here=="")'
     """
-    from rmpa.observe.sites import SITE_INFO
-
     with _connect(options, name) as client:
         report = _ask(client, SITE_INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import Options, argument, flag, graph_verb
+from rmpa.cli.options import Options, argument, completes, flag, graph_verb, options_of
 from rmpa.cli.output import Table, warn
 from rmpa.cli.resource import known_name, resource_names, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
@@ -130,7 +129,7 @@ def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Comm
             one = graph.pick(ctx.params.get("resource")).descriptor
             return [each.name for each in (one.profiles if what == "profile" else one.contexts)]
 
-        return run_with_resources(Options(False, ctx.params.get("agent"), ctx.params.get("master")), names)
+        return run_with_resources(options_of(ctx), names)
 
     complete = completes(offered, "rmpa.ros.node.node")
     name = click.argument("name", required=False, metavar=f"[{what.upper()}]", shell_complete=complete)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import completes, peers, topics
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.module import check_record, find_module
 from rmpa.cli.options import (
@@ -23,10 +22,14 @@ from rmpa.cli.options import (
     agent_option,
     agent_verb,
     argument,
+    completes,
     config_option,
     flag,
     json_option,
     json_verb,
+    options_of,
+    peers,
+    topics,
 )
 from rmpa.cli.output import Table, begin_log, size
 from rmpa.cli.recordings import (
@@ -207,9 +210,9 @@ def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
     return 0 if result.count else 1
 
 
-def names(_ctx: click.Context, _: str) -> Iterator[str]:
+def names(ctx: click.Context, _: str) -> Iterator[str]:
     """The names of recordings, for completion."""
-    with Options(False).client() as client:
+    with options_of(ctx).client() as client:
         yield from dict.fromkeys(kept.id for each in all_recordings(client) for kept in each.kept)
 
 

@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge.launched import ModuleResources
-from rmpa.cli.completion import graph_of, of_peer
 from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
-from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
+from rmpa.cli.options import Options, argument, count_option, flag, graph_of, graph_verb, of_peer
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import OUTSIDE_GUID, proxied_node, proxied_peer
-from rmpa.observe.control_client import ControlClient
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
@@ -300,9 +298,7 @@ def resource_list(options: Options) -> None:
 
 def _launched(master: Master) -> dict[tuple[str | None, str], LaunchedResource]:
     """What agents can start, by peer and by the name of the resource's node; nothing where they do not tell."""
-    if master.agent is None:
-        return {}
-    with contextlib.suppress(RmpaError), ControlClient(master.agent) as client:
+    with contextlib.suppress(RmpaError), master.client() as client:
         told = client.call("launch", tuple[ModuleResources, ...], what="list")
         own = told[0].module if told else ""
         return {

@@ -9,11 +9,19 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import services
 from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
-from rmpa.cli.options import FiniteRange, Options, Selection, argument, flag, graph_verb, selection_options, summary
-from rmpa.cli.output import Table, duration, print_json, printable, warn
-from rmpa.cli.values import fill_stamps, read_values, to_text
+from rmpa.cli.options import (
+    FiniteRange,
+    Options,
+    Selection,
+    argument,
+    flag,
+    graph_verb,
+    selection_options,
+    services,
+    summary,
+)
+from rmpa.cli.output import Table, duration, fill_stamps, print_json, printable, read_values, to_text, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api

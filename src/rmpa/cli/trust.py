@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import peers
 from rmpa.cli.module import agent_settings, find_module
-from rmpa.cli.options import Options, argument, config_option, flag, json_verb
+from rmpa.cli.options import Options, argument, config_option, flag, json_verb, peers
 from rmpa.cli.output import Table, confirm, duration, warn
 from rmpa.cli.units import STATE
 from rmpa.config import module_name
