@@ -11,7 +11,7 @@ import click
 
 from rmpa.cli.graph import GraphName, look_at_node, read_graph, read_name, unknown_name, with_node
 from rmpa.cli.main import verb
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes
+from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes, output_option
 from rmpa.cli.output import printable
 from rmpa.core.errors import StartError
 from rmpa.core.identity import proxied_node
@@ -31,7 +31,7 @@ _seconds = click.option(
 
 @graph_verb(
     argument("node", nodes),
-    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write it there."),
+    output_option("Write it there."),
     flag("--force", help="Replace the file that is there."),
     _seconds,
 )

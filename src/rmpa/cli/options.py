@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import click
@@ -181,6 +182,23 @@ config_option = click.option(
 def flag(*names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
     """An option that is given or not."""
     return click.option(*names, is_flag=True, help=help)
+
+
+def repeated_option(
+    *names: str,
+    metavar: str,
+    help: str,
+    find: Find | None = None,  # noqa: A002 - click's name
+) -> Callable[[_Function], _Function]:
+    """An option that may be given again, completed as an ``argument`` is."""
+    complete = completes(find) if find else None
+    return click.option(*names, multiple=True, metavar=metavar, shell_complete=complete, help=help)
+
+
+def output_option(help: str, metavar: str = "FILE", *, required: bool = False) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
+    """``--output``: where something is written."""
+    type_ = click.Path(path_type=Path)
+    return click.option("-o", "--output", type=type_, metavar=metavar, required=required, help=help)
 
 
 def count_option(what: str) -> Callable[[_Function], _Function]:

@@ -18,7 +18,16 @@ import click
 import msgspec
 
 from rmpa.cli.module import check_record
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb
+from rmpa.cli.options import (
+    FiniteRange,
+    Options,
+    argument,
+    flag,
+    graph_verb,
+    json_verb,
+    output_option,
+    repeated_option,
+)
 from rmpa.cli.output import Table, paint, print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.runtime.tasks import start_task
@@ -42,9 +51,9 @@ _COLOURS: Final = {"error": "red", "warn": "yellow", "info": ""}
     flag("-l", "--loop", help="Begin again at the end."),
     flag("--clock", help="Publish /clock, and set /use_sim_time while it plays."),
     flag("--pause", "paused", help="Begin with a pause."),
-    click.option("-t", "--topic", "globs", multiple=True, metavar="GLOB", help="Only these topics."),
-    click.option("--not", "deny", multiple=True, metavar="GLOB", help="Not these topics."),
-    click.option("-m", "--module", "modules", multiple=True, metavar="MODULE", help="Only what these modules said."),
+    repeated_option("-t", "--topic", "globs", metavar="GLOB", help="Only these topics."),
+    repeated_option("--not", "deny", metavar="GLOB", help="Not these topics."),
+    repeated_option("-m", "--module", "modules", metavar="MODULE", help="Only what these modules said."),
     flag("--over", help="Play topics that other nodes publish, too."),
     argument("remap", nargs=-1, metavar="[OLD:=NEW]..."),
 )
@@ -207,7 +216,7 @@ def _at(_context: click.Context, _parameter: click.Parameter, text: str | None) 
     click.option(
         "--at", callback=_at, metavar="TIME", help="Only the half minute around it: 58 (s), 12:15:58 (UTC)."
     ),
-    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write it: .md or .html."),
+    output_option("Write it: .md or .html."),
 )
 def story(recording: Path, at: float | time.struct_time | None, output: Path | None, options: Options) -> int:
     """Say what happened in a RECORDING: alarms, lost links, missed deadlines, profiles, gaps, errors, in order.
