@@ -52,7 +52,7 @@ _COLUMNS: Final = 80
 _HEADS: Final = ("Next:", "     ", "     ")
 
 
-@agent_verb(flag("--check", help="Change nothing; only say what would change."))
+@agent_verb(flag("--check", "Change nothing; only say what would change."))
 def reload(check: bool, options: Options) -> int:
     """Make the agent read its rmpa.toml again; what has not changed is not interrupted.
 
@@ -151,8 +151,8 @@ def explain(code: str | None, options: Options) -> None:
 
 @agent_verb(
     argument("name", topics, metavar="[PEER:]NAME"),
-    flag("-s", "--service", help="NAME is a service, although a topic has that name."),
-    flag("-m", "--module", help="NAME is a module: its link is checked."),
+    flag("-s --service", "NAME is a service, although a topic has that name."),
+    flag("-m --module", "NAME is a module: its link is checked."),
 )
 def why(name: str, service: bool, module: bool, options: Options) -> int:
     """Say why a topic of a peer does not arrive here, a service cannot be called, or a module is not linked.
@@ -211,7 +211,7 @@ def stage_lines(diagnosis: Diagnosis) -> Iterator[str]:
 @verb(
     setting_options("up"),
     config_option,
-    flag("-q", "--quiet", help="Only warnings (--log-level warning), and no advice about what to do next."),
+    flag("-q --quiet", "Only warnings (--log-level warning), and no advice about what to do next."),
 )
 def up(quiet: bool, **options: object) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.options import Options, flag, json_verb
+from rmpa.cli.options import Options, flag, json_verb, option
 from rmpa.cli.output import confirm
 from rmpa.cli.units import (
     CONFIG,
@@ -38,14 +38,7 @@ from rmpa.cli.units import (
     remove_folder,
     unit_texts,
 )
-from rmpa.config.module_name import (
-    GATEWAY_SUFFIX,
-    NameSource,
-    choose_name,
-    keep_name,
-    kept_name,
-    state_dir,
-)
+from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, kept_name, state_dir
 from rmpa.config.read import load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.config.toml_file import line_of
@@ -157,14 +150,14 @@ def _runs_as(program: str, uid: int, gid: int) -> bool:
 
 
 @json_verb(
-    flag("--web", help="The web server too: rmpa web, in a unit of its own."),
-    flag("--gateway", help="The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
-    flag("--realtime", help="Let the agent have real-time priority and locked memory."),
-    flag("--resources", help="Let nodes that the agent starts use devices, and go on without it."),
-    click.option("--name", metavar="NAME", help="The module's name. [default: the one that it has had]"),
-    click.option("--user", metavar="NAME", help="The user that the units run as. [default: rmpa, which is made]"),
-    flag("--dry-run", help="Change nothing; say what would be done, and print the units."),
-    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+    flag("--web", "The web server too: rmpa web, in a unit of its own."),
+    flag("--gateway", "The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
+    flag("--realtime", "Let the agent have real-time priority and locked memory."),
+    flag("--resources", "Let nodes that the agent starts use devices, and go on without it."),
+    option("--name", "NAME", "The module's name. [default: the one that it has had]"),
+    option("--user", "NAME", "The user that the units run as. [default: rmpa, which is made]"),
+    flag("--dry-run", "Change nothing; say what would be done, and print the units."),
+    option("--root", "DIR", "The folder of another system, such as an image.", default=""),
 )
 def service_install(
     web: bool,
@@ -222,8 +215,8 @@ def service_install(
     renamed = _take_over(machine, before, user, name)
     # Units that were made for another program would hide the package's.
     changed = _remove_made(machine, UNITS.values()) if packaged else _write_units(machine, wanted, program, user)
-    for option in (*(["realtime"] if realtime else []), *(["resources"] if resources else [])):
-        if machine.write(f"{UNIT_FOLDER}/{DROP_INS[option]}", drop_in_text(option, _MARK.format(unit=UNITS["up"]))):
+    for way in [*(["realtime"] if realtime else []), *(["resources"] if resources else [])]:
+        if machine.write(f"{UNIT_FOLDER}/{DROP_INS[way]}", drop_in_text(way, _MARK.format(unit=UNITS["up"]))):
             changed.append(UNITS["up"])
     if renamed:
         changed.extend(wanted)
@@ -497,12 +490,10 @@ def _peers() -> tuple[list[tuple[str, str]], str, str]:
 
 
 @json_verb(
-    flag(
-        "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are then lost."
-    ),
-    flag("--yes", help="Do not ask."),
-    flag("--dry-run", help="Change nothing; say what would be done."),
-    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+    flag("--purge", "Remove settings and state too, and the user rmpa: the module's name and keys are then lost."),
+    flag("--yes", "Do not ask."),
+    flag("--dry-run", "Change nothing; say what would be done."),
+    option("--root", "DIR", "The folder of another system, such as an image.", default=""),
 )
 def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options: Options) -> int:
     """Stop rmpa, disable it at boot, and remove what `rmpa service install` has made.

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.cli.options import Options, config_option, flag, json_verb
+from rmpa.cli.options import Options, config_option, flag, json_verb, option
 from rmpa.cli.output import GONE, USER_INFO, Table, print_text, size
 from rmpa.cli.units import UNITS
 from rmpa.config.module_name import of_unit, state_dir
@@ -93,9 +93,9 @@ Files that could not be filled say why.
 
 @json_verb(
     config_option,
-    click.option("-o", "--output", metavar="PATH", help="A .tar.gz, else a folder. [default: a .tar.gz here]"),
-    click.option("--log", metavar="FILE", type=click.Path(exists=True, dir_okay=False), help="A log of rmpa up."),
-    flag("--anonymous", help="Replace names of hosts and modules, and addresses, each by one word."),
+    option("-o --output", "PATH", "A .tar.gz, else a folder. [default: a .tar.gz here]"),
+    option("--log", "FILE", "A log of rmpa up.", type=click.Path(exists=True, dir_okay=False)),
+    flag("--anonymous", "Replace names of hosts and modules, and addresses, each by one word."),
 )
 def bug_report(config: str | None, output: str | None, log: str | None, anonymous: bool, options: Options) -> int:
     """Collect what a maintainer needs into one archive: versions, doctor, lists, settings, the end of the log.
@@ -336,17 +336,9 @@ _RULES: Final[tuple[tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], 
     ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]{1,40})-----.*?(?:-----END \1-----|\Z)"), GONE),
     ("ends of long lines", _LONG, lambda m: f"{m[1]}[{len(m[2])} characters cut]"),
     ("users and passwords of addresses", USER_INFO, rf"\1{GONE}@"),
-    (
-        "tokens",
-        re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}"),
-        GONE,
-    ),
+    ("tokens", re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}"), GONE),
     # As base64 has it, and the hexadecimal digits of a key. Those of md5 (a type's) and of a commit stay.
-    (
-        "random texts",
-        re.compile(r"(?<![\w+-])(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}"),
-        GONE,
-    ),
+    ("random texts", re.compile(r"(?<![\w+-])(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}"), GONE),
     ("random texts", re.compile(r"(?<![0-9a-fA-F])(?!(?:\w{32}|\w{40})\b)[0-9a-fA-F]{32,}"), GONE),
 )
 _QUOTED: Final = r"\\?\"(?:[^\"\\\n]|\\.){0,200}\"|'[^'\n]{0,200}'"

@@ -11,7 +11,7 @@ import click
 
 from rmpa.cli.graph import GraphName, look_at_node, read_graph, read_name, unknown_name, with_node
 from rmpa.cli.main import verb
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes, output_option
+from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes, option, output_option
 from rmpa.cli.output import printable
 from rmpa.core.errors import StartError
 from rmpa.core.identity import proxied_node
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from rmpa.ros.node.node import Node
 
 _CALLER_ID: Final = "/rmpa_resource"
-_seconds = click.option(
-    "--seconds", type=FiniteRange(0.5, 60.0), default=3.0, show_default=True, help="How long it looks at the node."
+_seconds = option(
+    "--seconds", help="How long it looks at the node.", type=FiniteRange(0.5, 60.0), default=3.0, show_default=True
 )
 
 
 @graph_verb(
     argument("node", nodes),
     output_option("Write it there."),
-    flag("--force", help="Replace the file that is there."),
+    flag("--force", "Replace the file that is there."),
     _seconds,
 )
 def resource_describe(node: str, output: Path | None, force: bool, seconds: float, options: Options) -> None:
@@ -73,7 +73,7 @@ def resource_describe(node: str, output: Path | None, force: bool, seconds: floa
 
 @graph_verb(
     argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path)),
-    flag("--offline", help="The file alone, without a graph."),
+    flag("--offline", "The file alone, without a graph."),
     _seconds,
 )
 def resource_check(file: Path, offline: bool, seconds: float, options: Options) -> int:

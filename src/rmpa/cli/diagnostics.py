@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from rmpa.cli.graph import find_peer, origin_text, read_graph, run_stream, with_node
-from rmpa.cli.options import Options, argument, flag, graph_verb, peers, summary
+from rmpa.cli.options import Options, argument, flag, graph_verb, option, peers, summary
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
@@ -36,15 +36,15 @@ _TICK: Final = 0.1
 
 @graph_verb(
     argument("modules", peers, nargs=-1, metavar="MODULE..."),
-    click.option(
+    option(
         "--level",
+        help="Only this level and worse ones.",
         type=click.Choice([level.lower() for level in LEVELS], case_sensitive=False),
         default="ok",
-        help="Only this level and worse ones.",
     ),
-    click.option("--name", default="*", metavar="PATTERN", help="Only names like this: '*battery*'."),
-    flag("-v", "--values", help="With the values."),
-    flag("-f", "--follow", help="Go on: print each change of a level, until Ctrl-C."),
+    option("--name", "PATTERN", "Only names like this: '*battery*'.", default="*"),
+    flag("-v --values", "With the values."),
+    flag("-f --follow", "Go on: print each change of a level, until Ctrl-C."),
 )
 def diagnostics(modules: tuple[str, ...], level: str, name: str, values: bool, follow: bool, options: Options) -> int:
     """Show what the nodes of all modules, or of each MODULE, say on /diagnostics: the worst first.

@@ -51,9 +51,9 @@ class Finding(NamedTuple):
 
 @json_verb(
     click.argument("file", required=False, metavar="[FILE]"),
-    flag("--system", help=f"Write {CONFIG}, which the units of rmpa service read."),
-    flag("--force", help="Replace the file that is there."),
-    flag("--dry-run", help="Write nothing; print the file. FILE - means the same."),
+    flag("--system", f"Write {CONFIG}, which the units of rmpa service read."),
+    flag("--force", "Replace the file that is there."),
+    flag("--dry-run", "Write nothing; print the file. FILE - means the same."),
 )
 def init(file: str | None, system: bool, force: bool, dry_run: bool, options: Options) -> None:
     """Write a first rmpa.toml, from what is found on this machine; the default of FILE is ./rmpa.toml.

@@ -23,7 +23,7 @@ from rmpa.cli.graph import (
     watch_topic,
     with_node,
 )
-from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, topics
+from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, option, topics
 from rmpa.cli.output import fill_stamps, flatten, pick, print_json, print_text, read_values, shorten, to_text, warn
 from rmpa.core.errors import ConfigError, UnreachableError
 from rmpa.core.identity import proxied_node
@@ -55,10 +55,10 @@ def split_field(text: str, graph: Graph) -> tuple[GraphName, list[str]]:
 @graph_verb(
     argument("topic", topics),
     count_option("messages"),
-    flag("-p", "--plot", help="Comma-separated values, for plotting."),
-    flag("--noarr", help="Leave arrays out."),
-    flag("--nostr", help="Leave strings out."),
-    flag("-c", "--clear", help="Clear the terminal before each message."),
+    flag("-p --plot", "Comma-separated values, for plotting."),
+    flag("--noarr", "Leave arrays out."),
+    flag("--nostr", "Leave strings out."),
+    flag("-c --clear", "Clear the terminal before each message."),
 )
 def topic_echo(
     topic: str, count: int | None, plot: bool, noarr: bool, nostr: bool, clear: bool, options: Options
@@ -118,9 +118,9 @@ def _csv(cells: list[str]) -> str:
     argument("topic", topics),
     argument("kind", metavar="TYPE"),
     argument("values", nargs=-1),
-    click.option("-r", "--rate", type=FiniteRange(0.001, 10_000), help="Messages a second, until Ctrl-C."),
-    flag("-1", "--once", help="Publish one message and end."),
-    flag("-l", "--latch", help="Latch, with -r too: a new subscriber gets the last message."),
+    option("-r --rate", help="Messages a second, until Ctrl-C.", type=FiniteRange(0.001, 10_000)),
+    flag("-1 --once", "Publish one message and end."),
+    flag("-l --latch", "Latch, with -r too: a new subscriber gets the last message."),
     context_settings={"ignore_unknown_options": True},
 )
 def topic_pub(

@@ -142,9 +142,7 @@ def _named(master: Master, names: tuple[str, ...], *, everything: bool) -> list[
 
 
 @graph_verb(
-    argument("node", nodes, default=""),
-    ping_options,
-    flag("-a", "--all", "everything", help="Each node of this module, once."),
+    argument("node", nodes, default=""), ping_options, flag("-a --all everything", "Each node of this module, once.")
 )
 def node_ping(node: str, count: int | None, interval: float, everything: bool, options: Options) -> int:
     """Ask whether a node answers, and how fast: a call of its slave API.
@@ -196,7 +194,7 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
 
 @graph_verb(
     argument("nodes", nodes, nargs=-1, metavar="NODE..."),
-    flag("-a", "--all", "everything", help="All of this module but /rosout and the agent's own."),
+    flag("-a --all everything", "All of this module but /rosout and the agent's own."),
 )
 def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int:
     """Ask nodes to end, and wait until they have ended.
@@ -247,7 +245,7 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
 
 @graph_verb(
     argument("namespace", nodes, default=""),
-    flag("-v", "--verbose", help="With module, address, and counts of topics and services."),
+    flag("-v --verbose", "With module, address, and counts of topics and services."),
     selection_options,
 )
 def node_list(namespace: str, verbose: bool, selection: Selection, options: Options) -> None:

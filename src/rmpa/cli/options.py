@@ -164,53 +164,56 @@ class FiniteRange(click.FloatRange):
         return found
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
-agent_option = click.option(
-    "--agent",
-    metavar="NAME",
-    shell_complete=completes(agents),
-    help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
-)
-_master_option = click.option(
-    "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
-)
-config_option = click.option(
-    "--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
-)
-
-
-def flag(*names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
-    """An option that is given or not."""
-    return click.option(*names, is_flag=True, help=help)
-
-
-def repeated_option(
-    *names: str,
-    metavar: str,
-    help: str,
-    find: Find | None = None,  # noqa: A002 - click's name
+def option(
+    names: str,
+    metavar: str = "",
+    help: str = "",  # noqa: A002 - click's name
+    *,
+    find: Find | None = None,
+    **settings: Any,
 ) -> Callable[[_Function], _Function]:
-    """An option that may be given again, completed as an ``argument`` is."""
+    """An option with a value.
+
+    Args:
+        names: As click has them, ``-n --count``, and the name of the function's argument if it is another one.
+        metavar: What stands for the value; empty: the name of its type.
+        help: The line of ``--help``.
+        find: As for ``argument``.
+        settings: For ``click.option``.
+    """
     complete = completes(find) if find else None
-    return click.option(*names, multiple=True, metavar=metavar, shell_complete=complete, help=help)
+    return click.option(*names.split(), metavar=metavar or None, help=help, shell_complete=complete, **settings)
+
+
+def flag(names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
+    """An option that is given or not; ``names`` as for ``option``."""
+    return click.option(*names.split(), is_flag=True, help=help)
+
+
+json_option = flag("--json as_json", "Print JSON; a stream prints one object a line.")
+agent_option = option(
+    "--agent", "NAME", "Which agent of this machine to ask, if several run. [env: RMPA_AGENT]", find=agents
+)
+_master_option = option("--master", "URI", "The ROS master to ask. [default: see rmpa topic --help]")
+config_option = option("--config", "FILE", "Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 
 
 def output_option(help: str, metavar: str = "FILE", *, required: bool = False) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
     """``--output``: where something is written."""
     type_ = click.Path(path_type=Path)
-    return click.option("-o", "--output", type=type_, metavar=metavar, required=required, help=help)
+    return option("-o --output", metavar, help, type=type_, required=required)
 
 
 def count_option(what: str) -> Callable[[_Function], _Function]:
     """``--count``: the end of a stream."""
-    return click.option("-n", "--count", type=click.IntRange(1), help=f"Stop after so many {what}.")
+    return option("-n --count", help=f"Stop after so many {what}.", type=click.IntRange(1))
 
 
 def ping_options(function: _Function) -> _Function:
     """Decorate with ``--count`` and ``--interval`` of a ping."""
     seconds = FiniteRange(0.01)
-    every = click.option("-i", "--interval", type=seconds, default=1.0, show_default=True, help="Seconds between.")
-    count = click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
+    every = option("-i --interval", help="Seconds between.", type=seconds, default=1.0, show_default=True)
+    count = option("-c --count", help="Stop after so many. [default: at Ctrl-C]", type=click.IntRange(1))
     return count(every(function))
 
 
@@ -380,8 +383,8 @@ def summary(total: int, what: str, counts: Iterable[str]) -> str:
 
 
 limit_options: Final = (
-    click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]"),
-    flag("--all", "everything", help="Leave nothing out on a terminal."),
+    option("--limit", help=f"At most so many. [default: {LINES} on a terminal]", type=click.IntRange(1)),
+    flag("--all everything", "Leave nothing out on a terminal."),
 )
 
 
@@ -392,8 +395,6 @@ def selection_options(function: Callable[..., _T]) -> Callable[..., _T]:
     def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _T:
         return function(**arguments, selection=Selection(match, peer, limit, everything))
 
-    match_option = click.option(
-        "--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."
-    )
-    peer_option = click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this.")
+    match_option = option("--match", "PATTERN", "Only names like this: '*/scan', 'arm?'.", default="")
+    peer_option = option("--peer", "PATTERN", "Only of modules with names like this.", default="")
     return decorated(command, (match_option, peer_option, *limit_options))

@@ -19,7 +19,7 @@ import yaml
 
 from rmpa.bridge.params.transfer import key_problem
 from rmpa.cli.graph import suggestion
-from rmpa.cli.options import Options, agent_verb, argument, completes, flag, graph_verb, options_of, peers
+from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb, option, options_of, peers
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
@@ -58,11 +58,8 @@ def param_names(ctx: click.Context, incomplete: str) -> Iterable[str]:
         yield from (before + each for each in with_namespaces(name))  # rosparam's verbs take namespaces too
 
 
-peer_option: Final = click.option(
-    "--peer",
-    metavar="PEER",
-    shell_complete=completes(peers),
-    help="The parameters of this peer's module (or its GUID); ros2/NODE: of a node of ROS 2.",
+peer_option: Final = option(
+    "--peer", "PEER", "The parameters of this peer's module (or its GUID); ros2/NODE: of a node of ROS 2.", find=peers
 )
 
 
@@ -227,11 +224,6 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _construct_value(loader: _Loader, node: yaml.ScalarNode) -> str:
-    """The text of a lone ``=``: PyYAML resolves it to a type that it cannot construct."""
-    return str(loader.construct_scalar(node))
-
-
 def _construct_angle(loader: _Loader, node: yaml.ScalarNode) -> float:
     """The angle in radians.
 
@@ -248,7 +240,8 @@ def _construct_angle(loader: _Loader, node: yaml.ScalarNode) -> float:
     return math.radians(angle) if node.tag == "!degrees" else angle
 
 
-_Loader.add_constructor("tag:yaml.org,2002:value", _construct_value)
+# The text of a lone ``=``: PyYAML resolves it to a type that it cannot construct.
+_Loader.add_constructor("tag:yaml.org,2002:value", lambda loader, node: str(loader.construct_scalar(node)))
 for _tag, _first, _pattern in (("!degrees", "d", r"^deg\([^)]*\)$"), ("!radians", "r", r"^rad\([^)]*\)$")):
     _Loader.add_constructor(_tag, _construct_angle)
     _Loader.add_implicit_resolver(_tag, re.compile(_pattern), [_first])
@@ -340,8 +333,7 @@ def param_verb(*parameters: Any, **settings: Any) -> Callable[[Callable[..., Non
 
 
 @param_verb(
-    argument("key", param_names),
-    flag("-p", "--pretty", help="Print a string as it is, without YAML's quotes and folding."),
+    argument("key", param_names), flag("-p --pretty", "Print a string as it is, without YAML's quotes and folding.")
 )
 def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> None:
     """Print the parameter KEY, or all of the namespace KEY, as YAML.
@@ -365,8 +357,8 @@ def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> Non
 @param_verb(
     argument("key", param_names),
     argument("value", required=False),
-    click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text."),
-    click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes."),
+    option("-t --textfile", "FILE", "Set it to this file's text."),
+    option("-b --binfile", "FILE", "Set it to this file's bytes."),
     context_settings={"ignore_unknown_options": True},
 )
 def param_set(

@@ -6,7 +6,6 @@ import contextlib
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-import click
 import msgspec
 
 from rmpa.cli.graph import find_peer, shown_state, suggestion
@@ -17,6 +16,7 @@ from rmpa.cli.options import (
     argument,
     flag,
     limit_options,
+    option,
     peers,
     ping_options,
     pings,
@@ -68,8 +68,8 @@ MODULE_FACTS: Final[tuple[tuple[str, Callable[[ModuleFacts], str]], ...]] = (
 
 @agent_verb(
     argument("pattern", peers, default=""),
-    flag("-v", "--verbose", help="With the side that dialled, clock, traffic, queue and drops."),
-    click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again."),
+    flag("-v --verbose", "With the side that dialled, clock, traffic, queue and drops."),
+    option("--state states", help="Only peers in this state; may be given again.", multiple=True),
     *limit_options,
 )
 def peer_list(
@@ -304,7 +304,7 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
         options.show(shown, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
 
 
-name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
+name_option = option("--name", "GATEWAY", "Ask this gateway of this machine, not --agent's.")
 
 
 def _connect(options: Options, name: str | None) -> ControlClient:

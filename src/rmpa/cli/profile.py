@@ -133,7 +133,7 @@ def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Comm
 
     complete = completes(offered, "rmpa.ros.node.node")
     name = click.argument("name", required=False, metavar=f"[{what.upper()}]", shell_complete=complete)
-    return graph_verb(argument("resource", resource_names), name, flag("--auto", help=auto))
+    return graph_verb(argument("resource", resource_names), name, flag("--auto", auto))
 
 
 def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Options) -> None:

@@ -23,9 +23,9 @@ from rmpa.cli.options import (
     config_option,
     flag,
     json_option,
+    option,
     output_option,
     peers,
-    repeated_option,
     topics,
 )
 from rmpa.cli.output import begin_log, size
@@ -67,12 +67,12 @@ _FULL: Final = 0.75
 
 @click.group(cls=LazyGroup, path="record", invoke_without_command=True, help=None)
 @output_option("Record into this file: .mcap or .bag.")
-@repeated_option("-t", "--topic", "globs", metavar="GLOB", find=topics, help="Only these topics.")
-@click.option("--duration", type=FiniteRange(0.1), metavar="SECONDS", help="Stop after so long. [default: at Ctrl-C]")
-@click.option("--size", "megabytes", type=FiniteRange(0.1), metavar="MB", help="Stop after so many MB of messages.")
-@flag("--here", help="Record what nodes of other modules publish, too: it crosses the network.")
-@flag("--mesh", help="Let all modules record their own nodes by their recorders, then fetch and merge that.")
-@repeated_option("--peer", "peers", metavar="NAME", find=peers, help="As --mesh, of these modules alone.")
+@option("-t --topic globs", "GLOB", "Only these topics.", multiple=True, find=topics)
+@option("--duration", "SECONDS", "Stop after so long. [default: at Ctrl-C]", type=FiniteRange(0.1))
+@option("--size megabytes", "MB", "Stop after so many MB of messages.", type=FiniteRange(0.1))
+@flag("--here", "Record what nodes of other modules publish, too: it crosses the network.")
+@flag("--mesh", "Let all modules record their own nodes by their recorders, then fetch and merge that.")
+@option("--peer peers", "NAME", "As --mesh, of these modules alone.", multiple=True, find=peers)
 @config_option
 @json_option
 @agent_option

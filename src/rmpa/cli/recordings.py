@@ -17,7 +17,7 @@ from rmpa.bridge.kept import recording_id
 from rmpa.bridge.limits import RECORDING_PART
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
 from rmpa.cli.module import check_record
-from rmpa.cli.options import FiniteRange, Options, agent_verb, argument, json_verb, options_of, output_option
+from rmpa.cli.options import FiniteRange, Options, agent_verb, argument, json_verb, option, options_of, output_option
 from rmpa.cli.output import Table, printable, size
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.limits import KIB
@@ -346,7 +346,7 @@ def record_info(recording: str, options: Options) -> int:
 
 @agent_verb(
     argument("why", required=False, default="by hand"),
-    click.option("--seconds", type=FiniteRange(0.1), help="How much of the past. [default: all that is there]"),
+    option("--seconds", help="How much of the past. [default: all that is there]", type=FiniteRange(0.1)),
     output_option("Fetch and merge it, too."),
 )
 def record_keep(why: str, seconds: float | None, output: Path | None, options: Options) -> int:
@@ -378,10 +378,7 @@ def record_keep(why: str, seconds: float | None, output: Path | None, options: O
     return int(not name or any(answers.values()))
 
 
-@agent_verb(
-    argument("recording", _names),
-    output_option("Where to. [default: ./RECORDING]", "DIR"),
-)
+@agent_verb(argument("recording", _names), output_option("Where to. [default: ./RECORDING]", "DIR"))
 def record_fetch(recording: str, output: Path | None, options: Options) -> int:
     """Fetch a RECORDING from all modules that have it, a folder each; what is there already is not fetched again.
 
@@ -412,7 +409,7 @@ def record_fetch(recording: str, output: Path | None, options: Options) -> int:
 @json_verb(
     argument("recordings", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)),
     output_option(".mcap or .bag.", required=True),
-    click.option("--clock", "reference", default="", metavar="MODULE", help="Whose clock. [default: the best known]"),
+    option("--clock reference", "MODULE", "Whose clock. [default: the best known]", default=""),
 )
 def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, options: Options) -> int:
     """Put RECORDINGS of several modules on one timeline: files, or folders as `rmpa record fetch` makes them.
@@ -442,7 +439,7 @@ def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, opt
     return int(bool(result.damaged))
 
 
-@agent_verb(argument("recording", _names), click.option("--module", default="", help="Only that of this module."))
+@agent_verb(argument("recording", _names), option("--module", help="Only that of this module.", default=""))
 def record_rm(recording: str, module: str, options: Options) -> int:
     """Remove a RECORDING at all modules that have it.
 

@@ -334,7 +334,7 @@ def status_of(status: Any) -> dict[str, Any]:
     }
 
 
-@graph_verb(flag("-a", "--all", "everything", help="Also those without a problem."))
+@graph_verb(flag("-a --all everything", "Also those without a problem."))
 def alarm_list(everything: bool, options: Options) -> None:
     """List the resources that have a problem, here and at peers.
 

@@ -17,6 +17,7 @@ from rmpa.cli.options import (
     argument,
     flag,
     graph_verb,
+    option,
     selection_options,
     services,
     summary,
@@ -118,29 +119,19 @@ def _of_agent(master: Master, services: tuple[str, ...] | bool) -> Sequence[Serv
     return snapshot.services if snapshot is not None else ()
 
 
-def _transport_text(info: ServiceInfo | None) -> str:
-    """The transport of a peer's service in a few words; empty for others."""
-    if info is None or info.transport == "direct":
-        return "direct" if info is not None else ""
-    return f"relayed ({info.condition})" if info.condition and info.wanted != "relay" else "relayed"
-
-
 def _crossing(infos: Sequence[ServiceInfo]) -> Iterator[str]:
     """Whether a service may cross, each peer that offers it, and how its calls went."""
     for info in infos:
-        yield f" * {_headline(info)}"
+        over_there = f", {info.wire} there" if info.wire else ""
+        state = f"not here: {info.hidden}" if info.hidden else info.state
+        headline = f"from {info.peer}: {info.node}{over_there}, {state}"
+        if info.direction == "out":
+            who = f", open at {', '.join(info.callers)}" if info.callers else ""
+            headline = f"{'may cross' if info.crosses else 'does not cross'}: {info.policy}{who}"
+        yield f" * {headline}"
         yield from (f"     {label:<10} {text}" for label, text in _facts(info))
         if info.problem:
             warn(f"{info.peer or info.node}: {info.problem}", "service-failed")
-
-
-def _headline(info: ServiceInfo) -> str:
-    if info.direction == "out":
-        who = f", open at {', '.join(info.callers)}" if info.callers else ""
-        return f"{'may cross' if info.crosses else 'does not cross'}: {info.policy}{who}"
-    over_there = f", {info.wire} there" if info.wire else ""
-    state = f"not here: {info.hidden}" if info.hidden else info.state
-    return f"from {info.peer}: {info.node}{over_there}, {state}"
 
 
 def _facts(info: ServiceInfo) -> Iterator[tuple[str, str]]:
@@ -171,7 +162,7 @@ def _json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, obj
 
 @graph_verb(
     argument("namespace", services, default=""),
-    flag("-v", "--verbose", help="Types and nodes too; each server is asked."),
+    flag("-v --verbose", "Types and nodes too; each server is asked."),
     selection_options,
 )
 def service_list(namespace: str, verbose: bool, selection: Selection, options: Options) -> None:
@@ -213,7 +204,11 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
     def row(name: str) -> list[str]:
         said, node = found[name].description, graph.server(name)
         kind = said.type if said is not None else "does not answer"
-        return [name, kind, origin_text(node or "unknown"), _transport_text(mesh.get(name))]
+        transport = ""
+        if (info := mesh.get(name)) is not None:
+            why = f" ({info.condition})" if info.condition and info.wanted != "relay" else ""
+            transport = "direct" if info.transport == "direct" else f"relayed{why}"
+        return [name, kind, origin_text(node or "unknown"), transport]
 
     def value(name: str) -> dict[str, object]:
         about, info = _json(graph, name, found.get(name)), mesh.get(name)
@@ -323,10 +318,8 @@ def service_find(kind: str, options: Options) -> None:
 @graph_verb(
     argument("service", services),
     argument("values", nargs=-1),
-    flag("-w", "--wait", help="Wait until the service exists, at most --timeout."),
-    click.option(
-        "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
-    ),
+    flag("-w --wait", "Wait until the service exists, at most --timeout."),
+    option("-t --timeout", help="Seconds for the answer.", type=FiniteRange(0.001), default=60.0, show_default=True),
     context_settings={"ignore_unknown_options": True},
 )
 def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: Options) -> None:

@@ -32,6 +32,7 @@ from rmpa.cli.options import (
     count_option,
     flag,
     graph_verb,
+    option,
     selection_options,
     summary,
     topics,
@@ -159,9 +160,9 @@ def _json(graph: Graph, name: str) -> dict[str, object]:
 
 @graph_verb(
     argument("namespace", topics, default=""),
-    flag("-v", "--verbose", help="Types and counts, publishers and subscribers apart."),
-    flag("-p", "--publishers", help="Only topics that have a publisher."),
-    flag("-s", "--subscribers", help="Only topics that have a subscriber."),
+    flag("-v --verbose", "Types and counts, publishers and subscribers apart."),
+    flag("-p --publishers", "Only topics that have a publisher."),
+    flag("-s --subscribers", "Only topics that have a subscriber."),
     selection_options,
 )
 def topic_list(
@@ -473,7 +474,7 @@ def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]
     """A ``graph_verb`` of a topic, with ``--window`` and ``--count``."""
     type_ = click.IntRange(2, 1_000_000)
     how_many = "Over how many messages."
-    messages = click.option("-w", "--window", type=type_, default=window, show_default=True, help=how_many)
+    messages = option("-w --window", help=how_many, type=type_, default=window, show_default=True)
     return graph_verb(argument("topic", topics), messages, count_option("messages"))
 
 
