@@ -300,15 +300,6 @@ class Graph:
         """The node that serves a service; empty: none is known."""
         return next(iter(self.services.get(service, ())), "")
 
-    def require_topic(self, topic: str) -> None:
-        """Check that a topic is there.
-
-        Raises:
-            RmpaError: It is not; the text offers the nearest one.
-        """
-        if topic not in self.publishers and topic not in self.subscribers:
-            raise unknown_name("topic", topic, self.topics)
-
     def require_service(self, wanted: GraphName) -> str:
         """Check that a service is there; return the node that serves it.
 

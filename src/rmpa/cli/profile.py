@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
+from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, argument, completes, flag, graph_verb, options_of
-from rmpa.cli.output import Table, warn
-from rmpa.cli.resource import known_name, resource_names, resource_verb, run_with_resources, status_of
+from rmpa.cli.output import Table, printable, warn
+from rmpa.cli.resource import resource_names, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.quality import MEASURED
 from rmpa.ros.types.definitions import ARRAY_TYPE
@@ -145,8 +146,10 @@ def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Opt
         offered: Sequence[Any] = one.descriptor.profiles if what == "profile" else one.descriptor.contexts
         if not offered:
             raise ConfigError("RESOURCE", f"{one} has no {what}s", "")
-        if name is not None:
-            known_name(what, name, (each.name for each in offered))
+        names = [each.name for each in offered]
+        if name is not None and name not in names:
+            remedy = suggestion(name, names, f"there are {printable(', '.join(names))}")
+            raise ConfigError(what.upper(), f"there is no {what} {name!r}", remedy)
         await graph.configure(one, {what: name or ""})
         options.show({**one.named, "chosen": name or ""})
 

@@ -17,7 +17,7 @@ from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggest
 from rmpa.cli.options import Options, argument, count_option, flag, graph_of, graph_verb, of_peer
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.identity import OUTSIDE_GUID, proxied_node, proxied_peer
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
@@ -271,29 +271,31 @@ def resource_list(options: Options) -> None:
                 text = "a request to that name reaches all of them; docs/guides/names.md shows how to separate them"
                 warn(f"{count} modules have a resource {path}: {text}", "same-names")
         states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
-        found: list[dict[str, Any]] = []
-        rows = []
+        found: list[tuple[dict[str, Any], LaunchedResource | None]] = []
         for one in graph.seen:
             said = one.descriptor
             about = {"name": one.path, "peer": one.peer, "role": said.role, "physical": said.physical}
             about |= {"description": said.description, "state": states.get(one)}
-            its = launched.pop((one.peer, one.path), None)
-            found.append(about | {"profile": profiles.get(one), "context": contexts.get(one)} | _started(its))
-            kind = "device" if said.physical else "simulated"
-            ends = [profiles.get(one) or "-", contexts.get(one) or "-", _processes(its), said.description]
-            rows.append([str(one), states.get(one) or "does not answer", said.role, kind, *ends])
+            about |= {"profile": profiles.get(one), "context": contexts.get(one)}
+            found.append((about, launched.pop((one.peer, one.path), None)))
         for (peer, path), its in launched.items():
             empty = dict.fromkeys(("role", "physical", "profile", "context"))
-            about = {"name": path, "peer": peer, **empty, "description": its.why, "state": its.state}
-            found.append(about | _started(its))
-            rows.append([str(GraphName(path, peer)), its.state, "-", "-", "-", "-", _processes(its), its.why])
-        colours = [_COLOURS.get(each["state"], "") for each in found]
+            found.append(({"name": path, "peer": peer, **empty, "description": its.why, "state": its.state}, its))
+        rows = [_row(*each) for each in found]
+        colours = [_COLOURS.get(about["state"], "") for about, _ in found]
         titles = "RESOURCE, STATE, ROLE, KIND, PROFILE, CONTEXT, PROCESSES, DESCRIPTION"
         if not any(row[6] for row in rows):
             titles, rows = titles.replace("PROCESSES, ", ""), [[*row[:6], row[7]] for row in rows]
-        options.show(found, Table(titles, rows, colours))
+        options.show([about | _started(its) for about, its in found], Table(titles, rows, colours))
 
     asyncio.run(with_resources(master, body))
+
+
+def _row(about: dict[str, Any], its: LaunchedResource | None) -> list[str]:
+    kind = {None: "-", True: "device", False: "simulated"}[about["physical"]]
+    ends = [about["profile"] or "-", about["context"] or "-", _processes(its), about["description"]]
+    state = about["state"] or "does not answer"
+    return [str(GraphName(about["name"], about["peer"])), state, about["role"] or "-", kind, *ends]
 
 
 def _launched(master: Master) -> dict[tuple[str | None, str], LaunchedResource]:
@@ -435,15 +437,3 @@ def _print_alarm(path: str, received: Received, alarm: dict[str, Any], *, as_jso
     for key, value in alarm["values"].items():
         if value.startswith("wanted "):
             print_text(f"    {key}: {value}")
-
-
-def known_name(what: str, text: str, known: Iterable[str]) -> None:
-    """Check that a resource has a profile or context of that name.
-
-    Raises:
-        ConfigError: It has none.
-    """
-    names = list(known)
-    if text not in names:
-        remedy = suggestion(text, names, f"there are {printable(', '.join(names)) or 'none'}")
-        raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)

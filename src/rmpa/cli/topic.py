@@ -22,6 +22,7 @@ from rmpa.cli.graph import (
     require_peer,
     run_stream,
     shown_state,
+    unknown_name,
     warn_unpublished,
     watch_topic,
 )
@@ -228,7 +229,8 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     wanted = read_name(text)
     master, graph = options.graph()
     require_peer(master, graph, wanted)
-    graph.require_topic(wanted.name)
+    if wanted.name not in graph.publishers and wanted.name not in graph.subscribers:
+        raise unknown_name("topic", wanted.name, graph.topics)
     return wanted, master, graph
 
 
