@@ -5,17 +5,16 @@ from __future__ import annotations
 import asyncio
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.graph import GraphName, look_at_node, read_graph, read_name, unknown_name, with_node
+from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.main import verb
 from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes, option, output_option
 from rmpa.cli.output import printable
 from rmpa.core.errors import StartError
 from rmpa.core.identity import proxied_node
-from rmpa.ros.http.rpc import call_api
 
 if TYPE_CHECKING:
     from rmpa.resource.checking import Misfit
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from rmpa.resource.resource import Resource
     from rmpa.ros.node.node import Node
 
-_CALLER_ID: Final = "/rmpa_resource"
 _seconds = option(
     "--seconds", help="How long it looks at the node.", type=FiniteRange(0.5, 60.0), default=3.0, show_default=True
 )
@@ -132,7 +130,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
     from rmpa.resource.checking import GraphCheck
 
     master = options.master()
-    graph = await read_graph(master)
+    graph = await master.graph()
     names = {node.name for node in resource.nodes.values()} & set(graph.nodes)
     servers = {node.server or node.name for node in resource.nodes.values()}
     sources = [source for each in resource.expressions() for source in each.sources.values()]
@@ -147,7 +145,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
             seconds=seconds,
         )
 
-    seen = await with_node(master, "rmpa_resource", body)
+    seen = await master.with_node("rmpa_resource", body)
     return GraphCheck(resource, text, file, graph.publishers, graph.types, graph.nodes, seen).misfits()
 
 
@@ -157,12 +155,11 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
     from rmpa.resource.describing import Found
 
     master = options.master()
-    graph = await read_graph(master)
+    graph = await master.graph()
     name = next((each for each in graph.nodes if _is(wanted, each)), None)
     if name is None:
         raise unknown_name("node", str(wanted), graph.nodes)
-    reply = await call_api(master.uri, "lookupNode", _CALLER_ID, name)
-    facts = await look_at_node(graph, name, str(reply.value) if reply.code == 1 else "")
+    facts = await master.node_facts(graph, name)
     ends = [t.removesuffix(live.DESCRIPTIONS) for t in facts.publications if t.endswith(live.DESCRIPTIONS)]
     server = name if name in ends else min(ends, key=len, default="")
     measured = [t for t in facts.publications if not t.endswith((live.DESCRIPTIONS, live.UPDATES, "/rosout"))]
@@ -177,7 +174,7 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
             seconds=seconds,
         )
 
-    seen = await with_node(master, "rmpa_resource", body)
+    seen = await master.with_node("rmpa_resource", body)
     started = live.started_by(facts.pid) if facts.pid else {}
     return Found(str(wanted), facts, seen, server, started, seconds)
 

@@ -13,16 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import (
-    Enough,
-    read_graph,
-    read_name,
-    require_peer,
-    run_stream,
-    warn_unpublished,
-    watch_topic,
-    with_node,
-)
+from rmpa.cli.graph import Enough, read_name, run_stream
 from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, option, topics
 from rmpa.cli.output import fill_stamps, flatten, pick, print_json, print_text, read_values, shorten, to_text, warn
 from rmpa.core.errors import ConfigError, UnreachableError
@@ -99,11 +90,11 @@ def topic_echo(
             raise Enough
 
     async def run() -> None:
-        graph = await read_graph(master)
+        graph = await master.graph()
         wanted, path = split_field(topic, graph)
-        require_peer(master, graph, wanted)
-        warn_unpublished(master, graph, wanted)
-        await watch_topic(master, wanted, lambda received: show(received, wanted, path))
+        master.require_peer(graph, wanted)
+        master.warn_unpublished(graph, wanted)
+        await master.watch(wanted, lambda received: show(received, wanted, path))
 
     run_stream(run)
 
@@ -184,7 +175,7 @@ def topic_pub(
             await _wait(node, max(0.0, begin + number / rate - time.monotonic()))
 
     try:
-        run_stream(lambda: with_node(master, "rmpa_pub", publish))
+        run_stream(lambda: master.with_node("rmpa_pub", publish))
     except UnreachableError as error:
         if unknown is None:
             raise

@@ -7,7 +7,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.cli.graph import Graph, GraphName, look_at_node, read_graph, read_name, require_peer, unknown_name
+from rmpa.cli.graph import CALLER_ID, Graph, GraphName, read_name
 from rmpa.cli.options import (
     Options,
     Selection,
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 # A node and its peer; ``None``: this module's own.
 _Line = tuple[str | None, NodeLine]
-_CALLER_ID: Final = "/rmpa_node"
 _ROSOUT: Final = "/rosout"
 # Modules that one line names.
 _NAMED: Final = 3
@@ -56,18 +55,6 @@ def _read_node(text: str) -> GraphName:
     wanted = read_name(text, "node")
     proxy = proxied_node(wanted.name) if wanted.peer is None else None
     return wanted if proxy is None else GraphName(proxy[1], proxy[0])
-
-
-async def _find_uri(master: Master, graph: Graph, name: str) -> str:
-    """The URI of the slave API of a node of a master's graph.
-
-    Raises:
-        RmpaError: There is no such node; the text offers the nearest one.
-    """
-    reply = await call_api(master.uri, "lookupNode", _CALLER_ID, name)
-    if reply.code == 1 and isinstance(reply.value, str):
-        return reply.value
-    raise unknown_name("node", name, [node for node in graph.nodes if proxied_peer(node) is None])
 
 
 def _module_of(master: Master) -> str | None:
@@ -137,7 +124,7 @@ def _named(master: Master, names: tuple[str, ...], *, everything: bool) -> list[
         raise ConfigError("NODE", "name some nodes, or say --all", "one of both")
     if names:
         return [_read_node(name) for name in names]
-    graph = asyncio.run(read_graph(master))
+    graph = asyncio.run(master.graph())
     return [_read_node(node) for node in graph.nodes if not is_own(node) and node != _ROSOUT]
 
 
@@ -162,7 +149,7 @@ def node_ping(node: str, count: int | None, interval: float, everything: bool, o
     if everything:
         answers = [_ping(master, one, 1, options) for one in found]
         return 0 if all(answers) else 1
-    require_peer(master, Graph(), found[0])
+    master.require_peer(Graph(), found[0])
     answered = False
     with contextlib.suppress(KeyboardInterrupt):
         for number in pings(count, interval):
@@ -174,8 +161,8 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
     """Ping a node once and print the result; return whether it answered."""
 
     async def here() -> NodePing:
-        uri = await _find_uri(master, await read_graph(master), wanted.name)
-        return await ping_node(wanted.name, uri, _CALLER_ID)
+        uri = await master.node_uri(await master.graph(), wanted.name)
+        return await ping_node(wanted.name, uri, CALLER_ID)
 
     about: dict[str, object] = {"node": str(wanted), "seq": number, "time": None}
     begin = time.monotonic()
@@ -227,8 +214,8 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
     """End a node; return why it lives on, with the code, or empty texts."""
 
     async def here() -> bool:
-        uri = await _find_uri(master, await read_graph(master), wanted.name)
-        return await end_node(wanted.name, uri, _CALLER_ID, "user request")
+        uri = await master.node_uri(await master.graph(), wanted.name)
+        return await end_node(wanted.name, uri, CALLER_ID, "user request")
 
     try:
         if wanted.peer is not None:
@@ -300,7 +287,7 @@ def _own(master: Master, graph: Graph, *, with_uris: bool) -> list[NodeLine]:
     asked = names if with_uris else [name for name in names if name in problems]
     uris: dict[str, str] = {}
     if asked:
-        answer = asyncio.run(call(master.uri, "system.multicall", lookup_calls(_CALLER_ID, asked, ())))
+        answer = asyncio.run(call(master.uri, "system.multicall", lookup_calls(CALLER_ID, asked, ())))
         uris = read_lookups(answer, asked, ())[0]
     lines = list_nodes(graph.publishers, graph.subscribers, graph.services, uris, problems)
     return [line for line in lines if proxied_peer(line.name) is None]
@@ -331,8 +318,7 @@ def node_info(node: str, options: Options) -> None:
     wanted = _read_node(node)
 
     async def here() -> NodeFacts:
-        graph = await read_graph(master)
-        return await look_at_node(graph, wanted.name, await _find_uri(master, graph, wanted.name))
+        return await master.node_facts(await master.graph(), wanted.name)
 
     facts = _ask_peer(master, wanted, "node.info", NodeFacts) if wanted.peer is not None else asyncio.run(here())
     module = wanted.peer or _module_of(master)
@@ -395,10 +381,10 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
 
 
 async def _levels(master: Master, node: str, logger: str, level: str) -> dict[str, str]:
-    reply = await call_api(master.uri, "lookupService", _CALLER_ID, f"{node}/get_loggers")
-    api = await _find_uri(master, await read_graph(master), node)
+    reply = await call_api(master.uri, "lookupService", CALLER_ID, f"{node}/get_loggers")
+    api = await master.node_uri(await master.graph(), node)
     if reply.code != 1 or not isinstance(reply.value, str):
         raise RmpaError(f"{node} has no loggers: it does not provide {node}/get_loggers", code="unknown-name")
     if level:
-        return await set_level(reply.value, node, _CALLER_ID, logger, level)
-    return await read_levels(reply.value, api, node, _CALLER_ID)
+        return await set_level(reply.value, node, CALLER_ID, logger, level)
+    return await read_levels(reply.value, api, node, CALLER_ID)

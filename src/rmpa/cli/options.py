@@ -23,7 +23,7 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
 
-    from rmpa.cli.graph import Graph, Master
+    from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
     from rmpa.config.schema import Setting
     from rmpa.observe.control_client import ControlClient
@@ -268,18 +268,22 @@ class Options:
 
         return choose_master(self.master_uri, self.agent, os.environ)
 
-    def graph(self) -> tuple[Master, Graph]:
+    def graph(self, wanted: GraphName | None = None) -> tuple[Master, Graph]:
         """The master that is meant, and its graph.
 
+        Args:
+            wanted: A name whose peer, if it has one, has to be known.
+
         Raises:
-            RmpaError: As ``choose_master`` and ``read_graph``.
+            RmpaError: As ``choose_master``, ``Master.graph`` and ``Master.require_peer``.
         """
         import asyncio
 
-        from rmpa.cli.graph import read_graph
-
         master = self.master()
-        return master, asyncio.run(read_graph(master))
+        graph = asyncio.run(master.graph())
+        if wanted is not None:
+            master.require_peer(graph, wanted)
+        return master, graph
 
 
 def _as_options(*declared: Callable[..., Any]) -> Callable[[Callable[..., _T]], Callable[..., _T]]:

@@ -18,7 +18,7 @@ import click
 import yaml
 
 from rmpa.bridge.params.transfer import key_problem
-from rmpa.cli.graph import suggestion
+from rmpa.cli.graph import CALLER_ID, suggestion
 from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb, option, options_of, peers
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.config.rules import ROS2
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from rmpa.cli.output import Text
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
-_CALLER: Final = "/rmpa_param"
 # Seconds for one call of a master: it may bring megabytes of XML, from a busy machine.
 _FOR_ALL: Final = 30.0
 _INT_MAX: Final = (1 << 31) - 1
@@ -114,7 +113,7 @@ class MasterParams:
         from rmpa.ros.http.rpc import call_api
 
         try:
-            return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
+            return asyncio.run(call_api(self.master.uri, method, CALLER_ID, *params, timeout=_FOR_ALL))
         except UnreachableError:
             raise self.master.unreachable() from None
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge.launched import ModuleResources
-from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
+from rmpa.cli.graph import GraphName, read_name, run_stream, suggestion
 from rmpa.cli.options import Options, argument, count_option, flag, graph_of, graph_verb, of_peer
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
@@ -162,7 +162,7 @@ def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitab
 
 async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
     """What ``body`` returns, run with all resources of a master's graph."""
-    graph = await read_graph(master)
+    graph = await master.graph()
     snapshot = await asyncio.to_thread(master.snapshot, topics=())
     peers = snapshot.peers if snapshot is not None else ()
     sites = {peer.name for peer in peers if peer.guid == OUTSIDE_GUID} - {ROS2}  # other sites that a gateway joins
@@ -170,7 +170,7 @@ async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitab
     async def within(node: Node) -> _T:
         return await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
-    return await with_node(master, "rmpa_resource", within)
+    return await master.with_node("rmpa_resource", within)
 
 
 async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) -> tuple[SeenResource, ...]:
@@ -407,7 +407,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
         warned = False
         while not enough.done():
             with contextlib.suppress(RmpaError):
-                graph = await read_graph(master)
+                graph = await master.graph()
                 for topic in graph.publishers.keys() - known:
                     path = topic.removesuffix("/alarms")
                     found = path != topic and graph.types.get(topic) == ARRAY_TYPE
@@ -423,7 +423,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
                 warn("there is no resource yet; waiting", "unknown-name")
             await asyncio.wait((enough,), timeout=_LOOK)
 
-    await with_node(master, "rmpa_alarm", look)
+    await master.with_node("rmpa_alarm", look)
 
 
 def _print_alarm(path: str, received: Received, alarm: dict[str, Any], *, as_json: bool) -> None:

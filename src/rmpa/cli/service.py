@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
+from rmpa.cli.graph import CALLER_ID, marked, origin_json, origin_text, peers_of, read_name
 from rmpa.cli.options import (
     FiniteRange,
     Options,
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
-_CALLER_ID: Final = "/rmpa_service"
 # Servers that are asked at the same time.
 _AT_ONCE: Final = 16
 # Seconds between two questions to the master whether the service is there.
@@ -78,7 +77,7 @@ async def _lookup(master: Master, name: str) -> str:
         RmpaError: It knows no such service.
     """
     try:
-        reply = await call_api(master.uri, "lookupService", _CALLER_ID, name)
+        reply = await call_api(master.uri, "lookupService", CALLER_ID, name)
     except UnreachableError:
         raise master.unreachable() from None
     if reply.code != 1:
@@ -100,7 +99,7 @@ def probe(master: Master, names: Iterable[str]) -> dict[str, Probed]:
         async with turns:
             try:
                 uri = await _lookup(master, name)
-                found = await ServiceConnection.probe(uri, name, _CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)
+                found = await ServiceConnection.probe(uri, name, CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)
                 return Probed(uri, found.description)
             except RmpaError as error:
                 return Probed(uri, None, str(error))
@@ -178,8 +177,7 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
       rmpa service list base:/
     """
     wanted = read_name(namespace or "/", "service")
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
+    master, graph = options.graph(wanted)
     peers = {name: peers_of(nodes) for name, nodes in sorted(graph.services.items())}
     every = [name for name, of in peers.items() if wanted.contains(name, of) and selection.wants(name, of)]
     shown = every
@@ -226,7 +224,7 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     wanted = read_name(text, "service")
     master, graph = options.graph()
     if wanted.name not in graph.services:
-        require_peer(master, graph, wanted)
+        master.require_peer(graph, wanted)
     return wanted, master, graph
 
 
@@ -347,11 +345,11 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
     async def ask() -> None:
         if wait:
             await _wait(master, wanted, timeout)
-        graph = await read_graph(master)
-        require_peer(master, graph, wanted)
+        graph = await master.graph()
+        master.require_peer(graph, wanted)
         graph.require_service(wanted)
         uri = await _lookup(master, wanted.name)
-        connection = await ServiceConnection.open(uri, wanted.name, _CALLER_ID, timeout=timeout)
+        connection = await ServiceConnection.open(uri, wanted.name, CALLER_ID, timeout=timeout)
         try:
             kind = find_service_type(connection.description.type, connection.description.md5sum)
             request = kind.request.serialize(fill_stamps(plain, time.time_ns()))
@@ -382,7 +380,7 @@ async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # n
         async with asyncio.timeout(timeout):
             while True:
                 try:
-                    (await read_graph(master)).require_service(wanted)
+                    (await master.graph()).require_service(wanted)
                 except RmpaError as error:
                     last = error
                 else:

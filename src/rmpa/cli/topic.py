@@ -19,12 +19,9 @@ from rmpa.cli.graph import (
     peers_mark,
     peers_of,
     read_name,
-    require_peer,
     run_stream,
     shown_state,
     unknown_name,
-    warn_unpublished,
-    watch_topic,
 )
 from rmpa.cli.options import (
     Options,
@@ -182,8 +179,7 @@ def topic_list(
       rmpa topic list joystick:/
     """
     wanted = read_name(namespace or "/")
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
+    _, graph = options.graph(wanted)
     peers = {name: peers_of(graph.publishers.get(name, ())) for name in graph.topics}
     names = [
         name
@@ -227,8 +223,7 @@ def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], na
 def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     """The topic that a user names, the master, and its graph, which has the topic."""
     wanted = read_name(text)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
+    master, graph = options.graph(wanted)
     if wanted.name not in graph.publishers and wanted.name not in graph.subscribers:
         raise unknown_name("topic", wanted.name, graph.topics)
     return wanted, master, graph
@@ -441,9 +436,8 @@ def _watch(
         delays: Whether the ages of messages are measured.
     """
     wanted = read_name(topic)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
-    warn_unpublished(master, graph, wanted)
+    master, graph = options.graph(wanted)
+    master.warn_unpublished(graph, wanted)
     seen, shown = _Window(window), -1
 
     def take(received: Received) -> None:
@@ -469,7 +463,7 @@ def _watch(
         lines = (f"{by}, from {printable(f'{each.peer} {each.node}')}: {remote(each)}" for each in routes)
         click.echo("\n\t".join([text, *lines]))
 
-    run_stream(lambda: watch_topic(master, wanted, take, show))
+    run_stream(lambda: master.watch(wanted, take, show))
 
 
 def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]:
