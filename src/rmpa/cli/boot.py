@@ -27,22 +27,27 @@ from rmpa.cli.units import (
     UNITS,
     USER,
     Machine,
-    check_machine,
     config_text,
     copy_state,
     drop_in_text,
-    entries,
-    modules_in,
     own_program,
     refused,
-    remove_folder,
     unit_texts,
 )
-from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, kept_name, state_dir
+from rmpa.config.module_name import (
+    GATEWAY_SUFFIX,
+    PLACES_FILE,
+    NameSource,
+    choose_name,
+    keep_name,
+    kept_name,
+    module_dir,
+    state_dir,
+)
 from rmpa.config.read import load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.config.toml_file import line_of
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_from, peer_name_problem
 from rmpa.runtime.systemd import INSTALL, is_set_up
 
@@ -114,7 +119,7 @@ def former(environ: Mapping[str, str], root: str = "") -> Former:
     return Former(
         user.pw_name,
         config if config is not None and str(config) != CONFIG else None,
-        state if state is not None and str(state) != STATE and entries(state) else None,
+        state if state is not None and str(state) != STATE and _entries(state) else None,
         chosen.name if chosen.source is not NameSource.DEFAULT else "",
         loaded.settings,
     )
@@ -189,8 +194,9 @@ def service_install(
       rmpa service install --dry-run               what would be done?
       sudo rmpa service install --root /mnt/image  for a machine that is not running
     """
-    machine = _machine("install", root, options, dry=dry_run)
-    root = machine.root
+    root = root.rstrip("/")
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    machine.check("install")
     if name and (problem := peer_name_problem(name)):
         raise ConfigError("--name", problem)
     program = own_program()
@@ -225,13 +231,6 @@ def service_install(
         machine.tell("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
     options.show({"units": wanted, "user": user, "changes": machine.changes, "dry_run": dry_run})
     return 0
-
-
-def _machine(verb: str, root: str, options: Options, *, dry: bool) -> Machine:
-    """The machine that a verb changes, once it is known that it can be changed."""
-    root = root.rstrip("/")
-    check_machine(root, verb, dry=dry)
-    return Machine(root, dry=dry, tell=(lambda _: None) if options.as_json else click.echo)
 
 
 def _check_name(machine: Machine, before: Former, name: str) -> None:
@@ -304,6 +303,35 @@ def _make_config(machine: Machine, before: Former) -> None:
         machine.path(CONFIG).chmod(0o644)
 
 
+def _entries(state: Path) -> list[Path]:
+    """What a state directory keeps of modules."""
+    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
+
+
+def _modules_in(state: Path, module: str, *, insecure: bool) -> tuple[dict[str, str], list[str]]:
+    """The folders of a state directory: those of a module and its gateway, with what is said of them; and others.
+
+    Args:
+        state: The directory.
+        module: The module.
+        insecure: Whether it may be without keys although others have some.
+
+    Raises:
+        StartError: It may not.
+    """
+    wanted = {module_dir(state, each) for each in (module, module + GATEWAY_SUFFIX)}
+    folders = [path for path in _entries(state) if path.is_dir() and not path.is_symlink()]
+    keys = {path: (path / "trust").is_dir() for path in folders}
+    others = [path.name for path in folders if path not in wanted]
+    secured = [path.name for path in folders if keys[path] and path not in wanted]
+    if secured and not keys.get(module_dir(state, module)) and not insecure:
+        problem = f"it has no keys in {state}, but {', '.join(secured)} has"
+        remedy = f"install that one, --name {secured[0]}; or first: rmpa trust join --name {module} TOKEN"
+        raise StartError(f"the module {module}", problem, remedy, code="keys-unusable")
+    ours = [path for path in folders if path in wanted]
+    return {path.name: f"{path.name}/{' with keys of a secured mesh' if keys[path] else ''}" for path in ours}, others
+
+
 def _take_over(machine: Machine, before: Former, user: str, name: str | None) -> bool:
     """Give the units what the user's agent has kept, unless they have kept something themselves; and the name.
 
@@ -313,11 +341,11 @@ def _take_over(machine: Machine, before: Former, user: str, name: str | None) ->
     place = machine.path(STATE)
     kept = kept_name(place)
     ids = None if machine.dry or os.geteuid() else machine.ids(user)
-    if entries(place):
+    if _entries(place):
         machine.tell(f"{STATE} stays as it is")
     elif before.state is not None:
         module = name or kept_name(before.state) or before.name or peer_name_from(socket.gethostname())
-        ours, others = modules_in(before.state, module, insecure=before.settings.trust.insecure)
+        ours, others = _modules_in(before.state, module, insecure=before.settings.trust.insecure)
         if others:
             machine.tell(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
         if ours or not others:
@@ -404,7 +432,7 @@ def service_status(options: Options) -> int:
       rmpa service status
       rmpa service status --json | jq .units
     """
-    check_machine("", "status", dry=True)
+    Machine("", dry=True).check("status")
     states = [_state(name) for name in UNITS.values()]
     # A package has all units, of which web server and gateway may be of no use here.
     units = [states[0], *(state for state in states[1:] if state["enabled"] or state["active"] not in _AWAY)]
@@ -508,8 +536,9 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
       sudo rmpa service uninstall --purge --yes   in a script
       rmpa service uninstall --dry-run
     """
-    machine = _machine("uninstall", root, options, dry=dry_run)
-    root = machine.root
+    root = root.rstrip("/")
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    machine.check("uninstall")
     if purge and machine.has_packaged():
         raise refused("uninstall", "the package has settings and state", "sudo apt purge rmpa")
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
@@ -566,7 +595,7 @@ def _purge(machine: Machine) -> None:
             config.parent.rmdir()
     for place in (state, machine.path(RUNTIME)):
         if place.is_dir() and machine.change(f"remove {str(place).removeprefix(machine.root)}"):
-            remove_folder(place, machine.root)
+            machine.remove_folder(place)
     for kind, name, _ in reversed(_ACCOUNTS):
         if machine.number(kind, name) is not None:
             machine.run(f"remove the {kind} {name}", f"{kind}del", name)

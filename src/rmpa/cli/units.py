@@ -27,7 +27,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.config.module_name import GATEWAY_SUFFIX, PLACES_FILE, module_dir
+from rmpa.config.module_name import PLACES_FILE
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 
 if TYPE_CHECKING:
@@ -216,6 +216,23 @@ class Machine:
         # Tells of something that is so already, too.
         self.tell = tell
 
+    def check(self, verb: str) -> None:
+        """Check that ``rmpa service VERB`` can change it.
+
+        Raises:
+            StartError: There is no systemd, or this user is not root.
+        """
+        if self.root:
+            if not Path(self.root).is_dir():
+                raise ConfigError("--root", f"{self.root} is no folder")
+        elif not _BOOTED.is_dir() or shutil.which("systemctl") is None:
+            problem = "this machine was not started by systemd (a container?)"
+            raise refused(verb, problem, "have `rmpa up` started by what starts programs here")
+        if os.geteuid() and not self.root and not self.dry:
+            given = sys.argv[1:] if sys.argv[1:2] == ["service"] else ["service", verb]
+            remedy = f"sudo {' '.join((own_program(), *given))}"
+            raise refused(verb, "only root may change the machine", remedy, "root-needed")
+
     def path(self, place: str) -> Path:
         """Where a file of the machine is."""
         return Path(f"{self.root}{place}")
@@ -264,6 +281,20 @@ class Machine:
             self.tell("".join(f"    {line}\n" for line in text.splitlines()).rstrip("\n"))
         return True
 
+    def remove_folder(self, place: Path) -> None:
+        """Remove a folder, and the link that leads to it: below another system's folder the link alone.
+
+        Raises:
+            StartError: It cannot be removed.
+        """
+        try:
+            if not (self.root and place.is_symlink()):
+                shutil.rmtree(place.resolve())
+            if place.is_symlink():
+                place.unlink()
+        except OSError as error:
+            raise StartError(str(place), f"cannot be removed: {error}", code="directory-unusable") from None
+
     def ids(self, user: str) -> tuple[int, int] | None:
         """The numbers of a user and of the units' group; ``None``: one of them is not there."""
         uid, gid = self.number("user", user), self.number("group", GROUP)
@@ -302,23 +333,6 @@ def refused(verb: str, problem: str, remedy: str, code: str = "service-unit") ->
     return StartError(f"rmpa service {verb}", problem, remedy, code=code)
 
 
-def check_machine(root: str, verb: str, *, dry: bool) -> None:
-    """Check that this machine can be changed.
-
-    Raises:
-        StartError: There is no systemd, or this user is not root.
-    """
-    if root:
-        if not Path(root).is_dir():
-            raise ConfigError("--root", f"{root} is no folder")
-    elif not _BOOTED.is_dir() or shutil.which("systemctl") is None:
-        problem = "this machine was not started by systemd (a container?)"
-        raise refused(verb, problem, "have `rmpa up` started by what starts programs here")
-    if os.geteuid() and not root and not dry:
-        words = [own_program(), *sys.argv[1:]] if sys.argv[1:2] == ["service"] else [own_program(), "service", verb]
-        raise refused(verb, "only root may change the machine", f"sudo {' '.join(words)}", "root-needed")
-
-
 def own_program() -> str:
     """The absolute path of the program ``rmpa`` that runs: a script of pip, that of a bundle, or the package's.
 
@@ -332,35 +346,6 @@ def own_program() -> str:
             return PACKAGED if packaged.exists() and packaged.samefile(path) else str(path.absolute())
     problem = f"there is no program rmpa in {prefix}/bin"
     raise StartError("rmpa", problem, "install it there, or use the bundle", code="service-unit")
-
-
-def entries(state: Path) -> list[Path]:
-    """What a state directory keeps of modules."""
-    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
-
-
-def modules_in(state: Path, module: str, *, insecure: bool) -> tuple[dict[str, str], list[str]]:
-    """The folders of a state directory: those of a module and its gateway, with what is said of them; and others.
-
-    Args:
-        state: The directory.
-        module: The module.
-        insecure: Whether it may be without keys although others have some.
-
-    Raises:
-        StartError: It may not.
-    """
-    wanted = {module_dir(state, each) for each in (module, module + GATEWAY_SUFFIX)}
-    folders = [path for path in entries(state) if path.is_dir() and not path.is_symlink()]
-    keys = {path: (path / "trust").is_dir() for path in folders}
-    others = [path.name for path in folders if path not in wanted]
-    secured = [path.name for path in folders if keys[path] and path not in wanted]
-    if secured and not keys.get(module_dir(state, module)) and not insecure:
-        problem = f"it has no keys in {state}, but {', '.join(secured)} has"
-        remedy = f"install that one, --name {secured[0]}; or first: rmpa trust join --name {module} TOKEN"
-        raise StartError(f"the module {module}", problem, remedy, code="keys-unusable")
-    ours = [path for path in folders if path in wanted]
-    return {path.name: f"{path.name}/{' with keys of a secured mesh' if keys[path] else ''}" for path in ours}, others
 
 
 def copy_state(state: Path, place: Path, ids: tuple[int, int] | None, without: Collection[str] = ()) -> None:
@@ -410,18 +395,3 @@ def _copy_files(state: Path, new: Path, without: Collection[str]) -> None:
             with os.fdopen(os.open(name, flags, dir_fd=place), "rb") as source, (to / name).open("xb") as copy:
                 os.fchmod(copy.fileno(), os.fstat(source.fileno()).st_mode & 0o777)
                 shutil.copyfileobj(source, copy)
-
-
-def remove_folder(place: Path, root: str) -> None:
-    """Remove a folder, and the link that leads to it: below another system's folder the link alone.
-
-    Raises:
-        StartError: It cannot be removed.
-    """
-    try:
-        if not (root and place.is_symlink()):
-            shutil.rmtree(place.resolve())
-        if place.is_symlink():
-            place.unlink()
-    except OSError as error:
-        raise StartError(str(place), f"cannot be removed: {error}", code="directory-unusable") from None
