@@ -18,8 +18,7 @@ from rmpa.config.read import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
 from rmpa.core.facts import ContractTerm, FollowedInfo
-from rmpa.observe.control import ReloadReply
-from rmpa.observe.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient, ReloadReply
 from rmpa.observe.graph import GraphRevision, TopicRow
 from rmpa.observe.snapshot import ModuleFacts, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis

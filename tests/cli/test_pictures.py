@@ -15,7 +15,7 @@ from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.facts import FollowedInfo
 from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.control import ReloadReply
+from rmpa.observe.control_client import ReloadReply
 from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.snapshot import PeerInfo, PingReply
 from rmpa.observe.snapshot_builder import judge_refusal

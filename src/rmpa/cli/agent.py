@@ -28,8 +28,7 @@ from rmpa.core import codes
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, WARN
-from rmpa.observe.control import ReloadReply
-from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir, same_core
+from rmpa.observe.control_client import ControlClient, ReloadReply, find_agents, runtime_dir, same_core
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import DEFAULT_MASTER_URI, shown_uri
 from rmpa.runtime.log_writer import LogWriter

@@ -476,8 +476,7 @@ def _show_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if as_json and not wanted:
         raise click.NoSuchOption("--json", ctx=ctx)
     if wanted:
-        from rmpa.cli import program
-
+        program = importlib.import_module("rmpa.cli.program")
         if as_json:
             from rmpa.cli.output import print_json
 

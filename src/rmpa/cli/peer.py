@@ -26,7 +26,7 @@ from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
-from rmpa.observe.control import GATEWAY_REPORT
+from rmpa.observe.control_client import GATEWAY_REPORT
 from rmpa.observe.sites import REPORT, SITE_INFO, SitesReport
 from rmpa.observe.snapshot import PENDING, ModuleFacts, PingReply
 
