@@ -60,16 +60,8 @@ if TYPE_CHECKING:
 _MARK: Final = "# Made by `rmpa service install`; changes belong into a drop-in: systemctl edit {unit}\n"
 # Behind the name of a unit that was written by hand, and is kept beside ours.
 _BY_HAND: Final = ".by-hand"
-# What `systemctl show` is asked for.
-_PROPERTIES: Final = (
-    *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
-    "StateChangeTimestampMonotonic",
-    "FragmentPath",
-)
 # The states of a unit that does nothing, or is not there.
 _AWAY: Final = ("inactive", "unknown")
-# Lines of a unit's log that are shown.
-_LOG_LINES: Final = 5
 # The accounts of the units, in the order in which they are made, with the words of ``groupadd`` and ``useradd``.
 _ACCOUNTS: Final = (
     ("group", GROUP, ("--system", GROUP)),
@@ -268,7 +260,7 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
             raise ConfigError("--web", "[web] enabled = true in rmpa.toml has the agent start it", "choose one")
     if gateway:
         check_gateway(settings)
-    if machine.root or settings.core_mode != "embedded" or _shown(UNITS["up"]).get("ActiveState") == "active":
+    if machine.root or settings.core_mode != "embedded" or machine.shown(UNITS["up"]).get("ActiveState") == "active":
         return
     from rmpa.runtime.kernel_tcp import program_at
 
@@ -388,7 +380,7 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
     if changed:
         machine.systemctl("daemon-reload")
     for unit in wanted:
-        now = _shown(unit)
+        now = machine.shown(unit)
         if now.get("ActiveState") == "active" and now.get("UnitFileState") == "enabled" and unit not in changed:
             machine.tell(f"{unit} runs")
             continue
@@ -398,27 +390,8 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
             if again:
                 machine.systemctl("restart", unit)
         except RmpaError as error:
-            text = "\n".join([str(error), *(f"  {line}" for line in _log(unit))])
+            text = "\n".join([str(error), *(f"  {line}" for line in machine.log(unit))])
             raise RmpaError(text, code="service-unit") from None
-
-
-def _shown(unit: str) -> dict[str, str]:
-    """What ``systemctl show`` says of a unit; empty where it says nothing."""
-    lines = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
-    return dict(line.partition("=")[::2] for line in lines)
-
-
-def _log(unit: str) -> list[str]:
-    """The last lines of a unit's log; empty for a user who may not read it."""
-    return _said("journalctl", "--quiet", "--no-pager", "--output=cat", f"--lines={_LOG_LINES}", f"--unit={unit}")
-
-
-def _said(*command: str) -> list[str]:
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    except OSError:
-        return []
-    return done.stdout.splitlines()
 
 
 @json_verb()
@@ -432,8 +405,9 @@ def service_status(options: Options) -> int:
       rmpa service status
       rmpa service status --json | jq .units
     """
-    Machine("", dry=True).check("status")
-    states = [_state(name) for name in UNITS.values()]
+    machine = Machine("", dry=True)
+    machine.check("status")
+    states = [_state(machine, name) for name in UNITS.values()]
     # A package has all units, of which web server and gateway may be of no use here.
     units = [states[0], *(state for state in states[1:] if state["enabled"] or state["active"] not in _AWAY)]
     peers, waiting, problem = _peers() if units[0]["active"] == "active" else ([], "", "")
@@ -452,8 +426,8 @@ def service_status(options: Options) -> int:
     return 0 if units[0]["active"] == "active" else 1
 
 
-def _state(unit: str) -> dict[str, object]:
-    shown = _shown(unit)
+def _state(machine: Machine, unit: str) -> dict[str, object]:
+    shown = machine.shown(unit)
     since = int(shown.get("StateChangeTimestampMonotonic") or 0) / 1e6
     installed = shown.get("LoadState") == "loaded"
     return {
@@ -467,7 +441,7 @@ def _state(unit: str) -> dict[str, object]:
         "result": shown.get("Result", ""),
         "pid": int(shown.get("MainPID") or 0) or None,
         "restarts": int(shown.get("NRestarts") or 0),
-        "log": _log(unit) if installed else [],
+        "log": machine.log(unit) if installed else [],
     }
 
 

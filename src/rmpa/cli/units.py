@@ -49,6 +49,13 @@ DROP_INS: Final = {"realtime": "rmpa.service.d/realtime.conf", "resources": "rmp
 # The folder of the administrator's units; a package has its own in one of the others.
 UNIT_FOLDER: Final = "/etc/systemd/system"
 _PACKAGED_UNITS: Final = ("/usr/lib/systemd/system", "/lib/systemd/system")
+# What `systemctl show` is asked for.
+_PROPERTIES: Final = (
+    *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
+    *("StateChangeTimestampMonotonic", "FragmentPath"),
+)
+# Lines of a unit's log that are shown.
+_LOG_LINES: Final = 5
 # Where systemd runs (sd_booted(3)).
 _BOOTED: Final = Path("/run/systemd/system")
 _DESCRIPTIONS: Final = {
@@ -265,6 +272,16 @@ class Machine:
         """Run ``systemctl`` on the machine."""
         self.run(f"run systemctl {' '.join(words)}", "systemctl", *words)
 
+    def shown(self, unit: str) -> dict[str, str]:
+        """What ``systemctl show`` says of a unit; empty where it says nothing."""
+        lines = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
+        return dict(line.partition("=")[::2] for line in lines)
+
+    def log(self, unit: str) -> list[str]:
+        """The last lines of a unit's log; empty for a user who may not read it."""
+        options = ("--quiet", "--no-pager", "--output=cat", f"--lines={_LOG_LINES}", f"--unit={unit}")
+        return _said("journalctl", *options)
+
     def write(self, place: str, text: str) -> bool:
         """Write a file unless it has this text already; return whether it has another one now."""
         path = self.path(place)
@@ -331,6 +348,14 @@ class Machine:
 def refused(verb: str, problem: str, remedy: str, code: str = "service-unit") -> StartError:
     """The error of ``rmpa service VERB``."""
     return StartError(f"rmpa service {verb}", problem, remedy, code=code)
+
+
+def _said(*command: str) -> list[str]:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    except OSError:
+        return []
+    return done.stdout.splitlines()
 
 
 def own_program() -> str:
