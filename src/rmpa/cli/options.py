@@ -145,7 +145,7 @@ def graph_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Ca
 
 
 def argument(name: str, find: Find | None = None, **settings: Any) -> Callable[[_Function], _Function]:
-    """An argument that a shell completes with the names that are found, as ``completion.completes`` does."""
+    """An argument that a shell completes with the names that are found, as ``completes`` does."""
     return click.argument(name, shell_complete=completes(find) if find else None, **settings)
 
 

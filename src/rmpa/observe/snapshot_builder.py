@@ -9,7 +9,7 @@ import contextlib
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -44,11 +44,12 @@ ADDRESS_SHARED_MARGIN: Final = 1.0
 _RESTART: Final = "sudo systemctl restart rmpa if the service runs it, else end it, then rmpa up"
 
 
-@dataclass(frozen=True, slots=True)
-class AgentParts:
-    """What an agent is observed by.
+@dataclass(slots=True, eq=False)
+class SnapshotBuilder:
+    """Builds snapshots of an agent; changes nothing.
 
     Args:
+        settings: The agent's settings.
         core: The agent's ROS core.
         facts: What its bridge tells.
         endpoint: Its identity, mesh and discovery now; ``None`` while it has no place in the network.
@@ -59,6 +60,7 @@ class AgentParts:
         restart: How to restart the agent, if its module has joined a secured mesh since it started; else empty.
     """
 
+    settings: Settings
     core: Core
     facts: BridgeFacts
     endpoint: Callable[[], tuple[Identity, Mesh, Discovery] | None]
@@ -67,28 +69,18 @@ class AgentParts:
     realtime: tuple[str, ...]
     trust: Callable[[], TrustStatus | None]
     restart: Callable[[], str]
+    _process: psutil.Process = field(default_factory=psutil.Process, init=False)
+    _cpu: float | None = field(default=None, init=False)
+    _cpu_known: float = field(default_factory=time.monotonic, init=False)
+    _began: float = field(default_factory=time.monotonic, init=False)
+    _started: float = field(default_factory=time.time, init=False)
 
-
-class SnapshotBuilder:
-    """Builds snapshots of an agent; changes nothing.
-
-    Args:
-        settings: The agent's settings.
-        parts: The parts of the agent.
-    """
-
-    def __init__(self, settings: Settings, parts: AgentParts) -> None:
-        self._settings = settings
-        self._parts = parts
-        self._process = psutil.Process()
+    def __post_init__(self) -> None:
         self._process.cpu_percent()  # the first call only begins to count
-        self._cpu: float | None = None
-        self._cpu_known = self._began = time.monotonic()
-        self._started = time.time()
 
     def reload(self, settings: Settings) -> None:
         """Use other settings from now on."""
-        self._settings = settings
+        self.settings = settings
 
     def build(
         self,
@@ -107,9 +99,8 @@ class SnapshotBuilder:
             most: Topics, and services, beyond which those are left out that nothing here uses; ``None``: all are in
                 it. The snapshot says how many are left out.
         """
-        parts, endpoint = self._parts, self._parts.endpoint()
-        counters: Counter[str] = Counter()
-        several = [parts.facts.bridge.counters, parts.core.counters, DESCRIPTORS.counters, parts.counters]
+        endpoint, counters = self.endpoint(), Counter[str]()
+        several = [self.facts.bridge.counters, self.core.counters, DESCRIPTORS.counters, self.counters]
         notes: list[str] = []
         if endpoint is not None:
             _, mesh, discovery = endpoint
@@ -122,41 +113,41 @@ class SnapshotBuilder:
         if services is None or isinstance(services, bool):
             services = None if services or (services is None and topics is None) else ()
         if most is not None and topics is None:
-            topics, topics_left = parts.facts.topics.used(most)
+            topics, topics_left = self.facts.topics.used(most)
         if most is not None and services is None:
-            services, services_left = parts.facts.services.used(most)
-        trust = parts.trust()
+            services, services_left = self.facts.services.used(most)
+        trust = self.trust()
         known, strangers = self._peer_infos(trust) if peers else ((), ())
         return Snapshot(
             agent=self.agent(),
             taken=time.time(),
             peers=known,
             strangers=strangers,
-            lost=parts.facts.lost(),
-            topics=parts.facts.topics.infos(topics),
-            services=parts.facts.services.infos(services),
+            lost=self.facts.lost(),
+            topics=self.facts.topics.infos(topics),
+            services=self.facts.services.infos(services),
             topics_left=topics_left,
             services_left=services_left,
             counters=dict(sorted(counters.items())),
             notes=(*notes, *self._notes()),
-            unreachable=parts.core.unreachable_infos(),
-            died=tuple(parts.core.liveness.died),
+            unreachable=self.core.unreachable_infos(),
+            died=tuple(self.core.liveness.died),
             trust=trust,
         )
 
     def _notes(self) -> Iterator[str]:
-        yield from self._parts.core.notes()
+        yield from self.core.notes()
         if DESCRIPTORS.problem:
             yield DESCRIPTORS.problem
-        yield from self._parts.notes()
-        yield from self._parts.facts.notes()
-        for outcome in self._parts.realtime:
+        yield from self.notes()
+        yield from self.facts.notes()
+        for outcome in self.realtime:
             if outcome.startswith("no "):
                 yield f"realtime: {outcome}; the agent's log says what would grant it"
 
     def agent(self) -> AgentInfo:
         """The agent itself."""
-        parts, endpoint = self._parts, self._parts.endpoint()
+        endpoint = self.endpoint()
         identity, _, discovery = endpoint or (None, None, None)
         now, rss = time.monotonic(), None
         with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
@@ -164,12 +155,12 @@ class SnapshotBuilder:
                 self._cpu, self._cpu_known = self._process.cpu_percent(), now
             rss = self._process.memory_info().rss
         return AgentInfo(
-            name=self._settings.name,
+            name=self.settings.name,
             guid=str(identity.guid) if identity else "",
             instance=identity.instance.hex() if identity else "",
-            domain=self._settings.domain,
+            domain=self.settings.domain,
             version=rmpa.__version__,
-            core_uri=parts.core.uri,
+            core_uri=self.core.uri,
             pid=os.getpid(),
             started=self._started,
             uptime=now - self._began,
@@ -177,20 +168,20 @@ class SnapshotBuilder:
             rss=rss,
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in discovery.interfaces) if discovery else (),
-            config_file=str(self._settings.config_file.absolute()) if self._settings.config_file else "",
-            realtime=parts.realtime,
+            config_file=str(self.settings.config_file.absolute()) if self.settings.config_file else "",
+            realtime=self.realtime,
             files=DESCRIPTORS.info(),
-            core_memory=parts.core.restored(),
-            **parts.facts.proxies(),
+            core_memory=self.core.restored(),
+            **self.facts.proxies(),
             **read_facts(AgentInfo),
         )
 
     def _peer_infos(self, trust: TrustStatus | None) -> tuple[tuple[PeerInfo, ...], tuple[PeerInfo, ...]]:
         """Every peer that is known, and the modules that are not of this mesh; both by name."""
-        if (endpoint := self._parts.endpoint()) is None:
+        if (endpoint := self.endpoint()) is None:
             return (), ()
         (identity, mesh, discovery), now = endpoint, time.monotonic()
-        links = {session.link.guid: session for session in self._parts.facts.bridge.sessions.linked()}
+        links = {session.link.guid: session for session in self.facts.bridge.sessions.linked()}
         roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
         yield_to_data()
         statuses = {status.identity.guid: status for status in mesh.peers()}
@@ -200,7 +191,7 @@ class SnapshotBuilder:
             for guid in yielding_to_data(known_guids)
         ]
         known, relayed = {info.instance: info for info in infos}, {}
-        for origin, via, topics in self._parts.facts.relayed():  # the membership may know of these modules too
+        for origin, via, topics in self.facts.relayed():  # the membership may know of these modules too
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
             changes = {"state": "relayed", "via": via, "topics_in": topics}
             relayed[origin.instance] = msgspec.structs.replace(known.get(origin.instance, blank), **changes)
@@ -213,7 +204,7 @@ class SnapshotBuilder:
             now,
             trust,
             joined=joined,
-            others={self._settings.name, *(each.name for each in relayed.values())},
+            others={self.settings.name, *(each.name for each in relayed.values())},
         )
         strange = [*(info for info in infos if info.state in (FOREIGN, PENDING)), *knocking]
         strange.sort(key=lambda info: (info.name, info.guid))
@@ -231,12 +222,12 @@ class SnapshotBuilder:
             state, since = "linked", session.link.since or now
         elif status is not None and status.foreign is not None:
             next_attempt = None
-            state, last_error, invite = judge_refusal(status.foreign, self._settings.name, self._parts.restart())
+            state, last_error, invite = judge_refusal(status.foreign, self.settings.name, self.restart())
         elif run is not None and view is not None and not view.present:
             state, since = "conflict", run.since
         elif status is not None and status.refused is not None and status.state == "refused":
             state = REVOKED if status.refused.code == TrustReason.REVOKED else "refused"
-        crossing = self._parts.facts.peer(session) if session is not None else {}
+        crossing = self.facts.peer(session) if session is not None else {}
         conflicts = (*(view.conflicts if view is not None else ()), *crossing.pop("conflicts", ()))
         return PeerInfo(
             name=identity.name,
