@@ -12,13 +12,13 @@ from rmpa.cli.options import (
     Options,
     Selection,
     argument,
+    by_module,
     flag,
     graph_verb,
     nodes,
     ping_options,
     pings,
     selection_options,
-    summary,
 )
 from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
@@ -259,22 +259,19 @@ def node_list(namespace: str, verbose: bool, selection: Selection, options: Opti
         for peer, line in found
         if wanted.contains(line.name, (peer,)) and selection.wants(line.name, (peer,))
     ]
-    long = not options.as_json and selection.is_long(every)
-    found = every[: selection.lines] if long else every  # this module's own are the first
+    shown = selection.first(every, lambda one: one[0] is not None)  # this module's own are the first
     here = _module_of(master) if options.as_json or verbose else None
 
     def text() -> Iterator[Text]:
-        if long:
-            yield summary(len(every), "nodes", ("remote" if peer else "of this module" for peer, _ in every))
-            yield ""
+        about = by_module("nodes", [peer is not None for peer, _ in every])
+        lines: Text = (paint(str(GraphName(line.name, peer)), "cyan" if peer else None) for peer, line in shown)
         if verbose:
-            yield Table("NODE, MODULE, >PUB, >SUB, >SRV, URI", [_row(peer, line, here) for peer, line in found])
-        else:
-            yield from (paint(str(GraphName(line.name, peer)), "cyan" if peer else None) for peer, line in found)
-        yield selection.rest(every, "nodes", "rmpa node list MODULE:/, /NAMESPACE, --match '*driver*'")
+            lines = Table("NODE, MODULE, >PUB, >SUB, >SRV, URI", [_row(peer, line, here) for peer, line in shown])
+        filters = "rmpa node list MODULE:/, /NAMESPACE, --match '*driver*'"
+        yield selection.framed(every, "nodes", about, filters, lines)
 
-    options.show([_json(peer, line, here) for peer, line in found], text())
-    for peer, line in found:
+    options.show([_json(peer, line, here) for peer, line in shown], text())
+    for peer, line in shown:
         if line.problem:
             warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}", "node-unreachable")
 

@@ -21,7 +21,7 @@ from rmpa.config.settings import SETTINGS
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
@@ -343,7 +343,7 @@ class Selection:
         match: Pattern of a shell for the name; empty: every name.
         peer: Pattern for the name of a module; empty: every module, and this one.
         limit: Lines to show at most; ``None``: as many as fit the way of output.
-        everything: Whether nothing is left out.
+        everything: Whether nothing is left out, as in JSON.
     """
 
     match: str = ""
@@ -368,16 +368,28 @@ class Selection:
         """Whether some of the items are left out."""
         return self.lines is not None and len(items) > self.lines
 
-    def rest(self, items: Collection[object], what: str, filters: str) -> list[str]:
-        """A line that says what was left out, and how to see it; none if all are shown.
+    def first(self, items: Sequence[_T], order: Callable[[_T], Any]) -> Sequence[_T]:
+        """Those that are shown: all as they are; of a long list the first ones in an order."""
+        return sorted(items, key=order)[: self.lines] if self.is_long(items) else items
+
+    def framed(self, items: Collection[object], what: str, about: Text, filters: str, shown: Text) -> Text:
+        """The text of a list; a long one has words in front, and behind it how to see what was left out.
 
         Args:
             items: All of them.
             what: What they are, in the plural.
+            about: The words in front of a long one.
             filters: Options that select fewer, for the user to try.
+            shown: The text of those that are shown.
         """
         left = len(items) - (self.lines or 0)
-        return [f"... {left:,} more {what}; fewer: {filters}; all: --all"] if self.is_long(items) else []
+        rest = f"... {left:,} more {what}; fewer: {filters}; all: --all"
+        return (about, "", shown, rest) if self.is_long(items) else shown
+
+
+def by_module(what: str, remote: Collection[bool]) -> str:
+    """A ``summary`` of what is of other modules, and of this one."""
+    return summary(len(remote), what, ("remote" if each else "of this module" for each in remote))
 
 
 def summary(total: int, what: str, counts: Iterable[str]) -> str:
@@ -396,8 +408,11 @@ def selection_options(function: Callable[..., _T]) -> Callable[..., _T]:
     """Decorate a list with ``--match``, ``--peer``, ``--limit`` and ``--all``; it gets them as ``selection``."""
 
     @functools.wraps(function)
-    def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _T:
-        return function(**arguments, selection=Selection(match, peer, limit, everything))
+    def command(
+        *, match: str, peer: str, limit: int | None, everything: bool, as_json: bool, **arguments: object
+    ) -> _T:
+        selection = Selection(match, peer, limit, everything or as_json)
+        return function(**arguments, as_json=as_json, selection=selection)
 
     match_option = option("--match", "PATTERN", "Only names like this: '*/scan', 'arm?'.", default="")
     peer_option = option("--peer", "PATTERN", "Only of modules with names like this.", default="")

@@ -95,27 +95,23 @@ def peer_list(
     """
     with options.client() as client:
         snapshot = client.snapshot(topics=())
-    selection = Selection(pattern, limit=limit, everything=everything)
+    selection = Selection(pattern, limit=limit, everything=everything or options.as_json)
     known = (*snapshot.peers, *snapshot.strangers)
     peers = [p for p in known if selection.wants(p.name, ()) and (not states or p.state in states)]
 
     def text() -> Iterator[Text]:
-        shown = peers
         if not known:
             where = ", ".join(snapshot.agent.interfaces) or "no interface"
             yield f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})"
         elif not peers:
             yield summary(len(known), "peers", (p.state for p in known)) + "; none of them matches"
         else:
-            if selection.is_long(peers):
-                yield summary(len(peers), "peers", (p.state for p in peers))
-                yield ""
-                shown = sorted(peers, key=_urgency)
             titles = _BRIEF + (", DIALLED, >CLOCK, >IN, >OUT, >QUEUE, >DROPS" if verbose else "")
-            shown = shown[: selection.lines]
+            shown = selection.first(peers, _urgency)
             rows = [_row(p)[: titles.count(",") + 1] for p in shown]
-            yield Table(titles, rows, [_COLOURS.get(p.state, "") for p in shown])
-            yield selection.rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
+            about = summary(len(peers), "peers", (p.state for p in peers))
+            table = Table(titles, rows, [_COLOURS.get(p.state, "") for p in shown])
+            yield selection.framed(peers, "peers", about, "rmpa peer list 'arm*', --state linked", table)
         troubles = _troubles(snapshot, sorted(peers, key=_urgency) if selection.is_long(peers) else peers)
         for trouble in troubles[: selection.lines]:
             warn(*trouble)

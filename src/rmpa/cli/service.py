@@ -15,12 +15,12 @@ from rmpa.cli.options import (
     Options,
     Selection,
     argument,
+    by_module,
     flag,
     graph_verb,
     option,
     selection_options,
     services,
-    summary,
 )
 from rmpa.cli.output import Table, duration, fill_stamps, print_json, printable, read_values, to_text, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
@@ -180,24 +180,20 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
     master, graph = options.graph(wanted)
     peers = {name: peers_of(nodes) for name, nodes in sorted(graph.services.items())}
     every = [name for name, of in peers.items() if wanted.contains(name, of) and selection.wants(name, of)]
-    shown = every
-    if not options.as_json and selection.is_long(every):
-        shown = sorted(every, key=lambda name: (bool(peers[name]), name))[: selection.lines]
+    shown = selection.first(every, lambda name: (bool(peers[name]), name))
     found = probe(master, shown) if verbose else {}
     mesh = {}
     if verbose or options.as_json:
         mesh = {info.name: info for info in _of_agent(master, services=True) if info.transport}
 
     def text() -> Iterator[Text]:
-        if shown is not every:
-            yield summary(len(every), "services", ("remote" if peers[n] else "of this module" for n in every))
-            yield ""
+        about = by_module("services", [bool(peers[name]) for name in every])
+        lines: Text = marked(shown, graph.services)
         if verbose:
             titles = "SERVICE, TYPE, NODE, TRANSPORT" if mesh else "SERVICE, TYPE, NODE"
-            yield Table(titles, [row(name)[: titles.count(",") + 1] for name in shown])
-        else:
-            yield from marked(shown, graph.services)
-        yield selection.rest(every, "services", "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'")
+            lines = Table(titles, [row(name)[: titles.count(",") + 1] for name in shown])
+        filters = "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'"
+        yield selection.framed(every, "services", about, filters, lines)
 
     def row(name: str) -> list[str]:
         said, node = found[name].description, graph.server(name)

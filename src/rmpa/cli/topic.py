@@ -27,12 +27,12 @@ from rmpa.cli.options import (
     Options,
     Selection,
     argument,
+    by_module,
     count_option,
     flag,
     graph_verb,
     option,
     selection_options,
-    summary,
     topics,
 )
 from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
@@ -191,28 +191,24 @@ def topic_list(
     ]
 
     def text() -> Iterator[Text]:
-        shown = names
-        if selection.is_long(names):
-            remote = {name for name in names if peers[name] and all(map(proxied_peer, graph.publishers[name]))}
-            owners = {peer for name in remote for peer in peers[name]}
-            yield summary(len(names), "topics", ("remote" if n in remote else "of this module" for n in names))
-            yield f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}"
-            yield ""
-            shown = sorted(names, key=lambda name: (name in remote, name))[: selection.lines]
+        remote = {name for name in names if peers[name] and all(map(proxied_peer, graph.publishers[name]))}
+        owners = {peer for name in remote for peer in peers[name]}
+        whose = f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}"
+        about = (by_module("topics", [name in remote for name in names]), whose)
+        shown = selection.first(names, lambda name: (name in remote, name))
+        lines: Text = marked(shown, graph.publishers)
         if verbose:
-            if not subscribers:
-                yield from _verbose("Published topics", "publisher", graph, graph.publishers, shown)
-            if not publishers:
-                yield from _verbose("Subscribed topics", "subscriber", graph, graph.subscribers, shown)
-        else:
-            yield from marked(shown, graph.publishers)
-        yield selection.rest(names, "topics", "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'")
+            published = () if subscribers else _verbose("Published", "publisher", graph, graph.publishers, shown)
+            subscribed = () if publishers else _verbose("Subscribed", "subscriber", graph, graph.subscribers, shown)
+            lines = (published, subscribed)
+        filters = "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'"
+        yield selection.framed(names, "topics", about, filters, lines)
 
     options.show([_json(graph, name) for name in names] if options.as_json else None, text())
 
 
-def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], names: list[str]) -> Iterator[str]:
-    yield f"{title}:"
+def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], names: Sequence[str]) -> Iterator[str]:
+    yield f"{title} topics:"
     for name in names:
         if name in ends:
             kind, count = printable(graph.types.get(name, "unknown type")), len(ends[name])
