@@ -50,7 +50,7 @@ _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
 
 
 def param_names(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Parameters, and namespaces of them, for ``completion.completes``."""
+    """Parameters, and namespaces of them, for ``options.completes``."""
     before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
     peer, _ = split_peer(ctx.params.get("peer"), incomplete)
     for name in open_store(peer, options_of(ctx)).names():

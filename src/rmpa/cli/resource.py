@@ -230,7 +230,7 @@ async def _first_messages(node: Node, wanted: Iterable[tuple[str, str]], kind: s
 
 
 def resource_names(ctx: click.Context, _: str) -> Iterable[str]:
-    """Resources of the graph, for ``completion.completes``."""
+    """Resources of the graph, for ``options.completes``."""
     ending = f"/{TOPIC}"
     for topic, nodes in graph_of(ctx).publishers.items():
         if topic.endswith(ending):
