@@ -64,8 +64,7 @@ def grouped(digits: str) -> str:
     argument("name"),
     config_option,
 )
-@click.pass_context
-def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
+def trust_check(peer: str, what: str, name: str, config: str | None, options: Options) -> int:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
     PEER is a module, a site, ros2, or web for the clients of rmpa web. Without --config the rules are those that the
@@ -95,7 +94,7 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     options.show({**shown, "groups": permissions.groups_of(peer), "files": files}, text)
     if not files and not options.as_json:
         warn("no rmpa.toml was found here; --config names the file that rmpa up was started with", "doubtful-setting")
-    ctx.exit(0 if decision.allowed else 1)
+    return 0 if decision.allowed else 1
 
 
 @module_verb(option("--label", "TEXT", "A name for the mesh, which its certificates contain.", default=""))
