@@ -24,7 +24,7 @@ from dataclasses import asdict
 from ipaddress import ip_address
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import click
 import msgspec
@@ -331,8 +331,24 @@ _WORDS: Final = f"{_TO_THE_END}|{_OTHERS}"
 _IS_SECRET: Final = re.compile(_WORDS, re.IGNORECASE)
 # Names of files and the like: that they hold a secret does not make them one.
 _IS_PLACE: Final = re.compile(r"(file|path|dir|folder)s?$", re.IGNORECASE)
-# By what is counted: the pattern, and what takes its place.
-_RULES: Final[tuple[tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], str]], ...]] = (
+_QUOTED: Final = r"\\?\"(?:[^\"\\\n]|\\.){0,200}\"|'[^'\n]{0,200}'"
+_NAME: Final = r"[\w.-]{0,60}(?<!file)(?<!path)(?<!dir)(?<!folder)"
+_IS: Final = r"\\?[\"']?[ \t]{0,9}[:=][ \t]{0,9}"
+
+
+def is_secret(key: str) -> bool:
+    """Whether the value of a variable or key is likely to be a secret."""
+    return bool(_IS_SECRET.search(key)) and not _IS_PLACE.search(key)
+
+
+def _value_of(match: re.Match[str]) -> str:
+    key, between, _ = match.groups()
+    return f"{key}{between}{GONE}" if is_secret(key) else match[0]
+
+
+# What is counted, the pattern, and what takes its place.
+_Rule: TypeAlias = "tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], str]]"
+_RULES: Final[tuple[_Rule, ...]] = (
     ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]{1,40})-----.*?(?:-----END \1-----|\Z)"), GONE),
     ("ends of long lines", _LONG, lambda m: f"{m[1]}[{len(m[2])} characters cut]"),
     ("users and passwords of addresses", USER_INFO, rf"\1{GONE}@"),
@@ -340,18 +356,19 @@ _RULES: Final[tuple[tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], 
     # As base64 has it, and the hexadecimal digits of a key. Those of md5 (a type's) and of a commit stay.
     ("random texts", re.compile(r"(?<![\w+-])(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}"), GONE),
     ("random texts", re.compile(r"(?<![0-9a-fA-F])(?!(?:\w{32}|\w{40})\b)[0-9a-fA-F]{32,}"), GONE),
-)
-_QUOTED: Final = r"\\?\"(?:[^\"\\\n]|\\.){0,200}\"|'[^'\n]{0,200}'"
-_NAME: Final = r"[\w.-]{0,60}(?<!file)(?<!path)(?<!dir)(?<!folder)"
-_IS: Final = r"\\?[\"']?[ \t]{0,9}[:=][ \t]{0,9}"
-_NAMED: Final = tuple(
-    re.compile(rf"(?i)({begin}(?:{words}){_NAME})({between})({_QUOTED}|{value})")
-    for begin, words, between, value in (
-        ("", _TO_THE_END, _IS, ".+"),
-        ("", _OTHERS, _IS, r"\S+"),
-        (r"(?<![\w-])--[\w-]{0,60}", _WORDS, r"\s{1,9}", r"\S+"),  # --token …
-        (r"\b", "password|passphrase", r"[ \t]{1,9}(?:(?:is|was)[ \t]{1,9})?", r"\S+"),  # the password …
-    )
+    *(
+        (
+            "values of secret names",
+            re.compile(rf"(?i)({begin}(?:{words}){_NAME})({between})({_QUOTED}|{value})"),
+            _value_of,
+        )
+        for begin, words, between, value in (
+            ("", _TO_THE_END, _IS, ".+"),
+            ("", _OTHERS, _IS, r"\S+"),
+            (r"(?<![\w-])--[\w-]{0,60}", _WORDS, r"\s{1,9}", r"\S+"),  # --token …
+            (r"\b", "password|passphrase", r"[ \t]{1,9}(?:(?:is|was)[ \t]{1,9})?", r"\S+"),  # the password …
+        )
+    ),
 )
 _HOME: Final = re.compile(r"/(?:home|Users)/[^/\s\"':;,\])}]+|/root(?![\w-])")
 _HOST: Final = re.compile(r"(?<=://)[A-Za-z][\w.-]*")
@@ -377,12 +394,15 @@ class Redactor:
     """
 
     def __init__(self, secrets: Iterable[str] = (), homes: Iterable[str] = (), users: Iterable[str] = ()) -> None:
-        self._secrets = _any_of(secret for secret in secrets if len(secret) > 5)
-        self._homes = _any_of(home for home in homes if home not in ("", "/"))
-        self._users = _words(user for user in users if user not in _NO_PERSON)
+        self._rules: list[_Rule] = [
+            ("secrets of this machine", _any_of(secret for secret in secrets if len(secret) > 5), GONE),
+            *_RULES,
+            ("home directories", _any_of(home for home in homes if home not in ("", "/")), "~"),
+            ("home directories", _HOME, "~"),
+            ("user names", _words(user for user in users if user not in _NO_PERSON), "[user]"),
+        ]
         self.counts: Counter[str] = Counter()
         self.aliases: dict[str, str] = {}
-        self._named: re.Pattern[str] | None = None
 
     def anonymise(self, texts: Iterable[str], hosts: Iterable[str], modules: Iterable[str]) -> None:
         """Give hosts, modules and addresses of these texts other names from now on."""
@@ -391,23 +411,16 @@ class Redactor:
         for kind, names in (("host", [*hosts, *found]), ("module", modules)):
             for number, name in enumerate(sorted({*names} - {"", "localhost", *self.aliases}), 1):
                 self.aliases[name] = f"{kind}-{number}"
-        self._named = _words(self.aliases)
+        named = _words(self.aliases)
         addresses = {each for text in texts for pattern in (_MAC, _ADDRESS) for each in pattern.findall(text)}
         self.aliases |= {each: f"address-{n}" for n, each in enumerate(filter(_is_telling, sorted(addresses)), 1)}
+        for pattern in (_MAC, _ADDRESS, named):
+            self._rules.append(("hosts and addresses", pattern, lambda match: self.aliases.get(match[0], match[0])))
 
     def text(self, text: str) -> str:
         """A text without what is not to be seen."""
-        text = self._swap("secrets of this machine", self._secrets, GONE, text)
-        for what, pattern, by in _RULES:
+        for what, pattern, by in self._rules:
             text = self._swap(what, pattern, by, text)
-        for pattern in _NAMED:
-            text = self._swap("values of secret names", pattern, _value_of, text)
-        for home in (self._homes, _HOME):
-            text = self._swap("home directories", home, "~", text)
-        text = self._swap("user names", self._users, "[user]", text)
-        if self.aliases:
-            for alias in (_MAC, _ADDRESS, self._named):
-                text = self._swap("hosts and addresses", alias, lambda m: self.aliases.get(m[0], m[0]), text)
         return text
 
     def value(self, value: object, key: str = "") -> object:
@@ -423,11 +436,7 @@ class Redactor:
             return GONE
         return self.text(value)
 
-    def _swap(
-        self, what: str, pattern: re.Pattern[str] | None, by: str | Callable[[re.Match[str]], str], text: str
-    ) -> str:
-        if pattern is None:
-            return text
+    def _swap(self, what: str, pattern: re.Pattern[str], by: str | Callable[[re.Match[str]], str], text: str) -> str:
         count = 0
 
         def swapped(match: re.Match[str]) -> str:
@@ -441,16 +450,6 @@ class Redactor:
         return text
 
 
-def _value_of(match: re.Match[str]) -> str:
-    key, between, _ = match.groups()
-    return f"{key}{between}{GONE}" if is_secret(key) else match[0]
-
-
-def is_secret(key: str) -> bool:
-    """Whether the value of a variable or key is likely to be a secret."""
-    return bool(_IS_SECRET.search(key)) and not _IS_PLACE.search(key)
-
-
 def _is_telling(text: str) -> bool:
     """Whether an address tells anything of a network."""
     try:
@@ -460,11 +459,10 @@ def _is_telling(text: str) -> bool:
     return not (address.is_loopback or address.is_unspecified or address.is_multicast or text.startswith("255."))
 
 
-def _any_of(texts: Iterable[str]) -> re.Pattern[str] | None:
-    found = sorted({*texts}, key=len, reverse=True)
-    return re.compile("|".join(map(re.escape, found))) if found else None
+def _any_of(texts: Iterable[str]) -> re.Pattern[str]:
+    """Matches each of some texts, the longest first; nothing where there is none."""
+    return re.compile("|".join(map(re.escape, sorted({*texts}, key=len, reverse=True))) or "(?!)")
 
 
-def _words(texts: Iterable[str]) -> re.Pattern[str] | None:
-    pattern = _any_of(text for text in texts if text)
-    return re.compile(rf"(?<![A-Za-z0-9_])(?:{pattern.pattern})(?![A-Za-z0-9_])") if pattern else None
+def _words(texts: Iterable[str]) -> re.Pattern[str]:
+    return re.compile(rf"(?<![A-Za-z0-9_])(?:{_any_of(filter(None, texts)).pattern})(?![A-Za-z0-9_])")
