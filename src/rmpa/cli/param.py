@@ -223,6 +223,11 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
+def _construct_value(loader: _Loader, node: yaml.ScalarNode) -> str:
+    """The text of a lone ``=``: PyYAML resolves it to a type that it cannot construct."""
+    return str(loader.construct_scalar(node))
+
+
 def _construct_angle(loader: _Loader, node: yaml.ScalarNode) -> float:
     """The angle in radians.
 
@@ -239,8 +244,7 @@ def _construct_angle(loader: _Loader, node: yaml.ScalarNode) -> float:
     return math.radians(angle) if node.tag == "!degrees" else angle
 
 
-# The text of a lone ``=``: PyYAML resolves it to a type that it cannot construct.
-_Loader.add_constructor("tag:yaml.org,2002:value", lambda loader, node: str(loader.construct_scalar(node)))
+_Loader.add_constructor("tag:yaml.org,2002:value", _construct_value)
 for _tag, _first, _pattern in (("!degrees", "d", r"^deg\([^)]*\)$"), ("!radians", "r", r"^rad\([^)]*\)$")):
     _Loader.add_constructor(_tag, _construct_angle)
     _Loader.add_implicit_resolver(_tag, re.compile(_pattern), [_first])
