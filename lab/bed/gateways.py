@@ -20,8 +20,7 @@ import psutil
 
 from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import CommandFailed, Process, eventually
-from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.control_client import ControlClient, choose_agent
+from rmpa.observe.control_client import GATEWAY_REPORT, ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

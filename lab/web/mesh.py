@@ -21,8 +21,7 @@ import msgspec
 from lab.nodes.node import say
 from rmpa.core.facts import LatencyInfo, LinkInfo, RouteInfo, ServiceInfo, TopicInfo
 from rmpa.core.statistics import SampleSpread
-from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.control_client import ControlClient
+from rmpa.observe.control_client import ControlClient, ControlReply, ControlRequest
 from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 if TYPE_CHECKING:

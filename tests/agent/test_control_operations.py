@@ -11,14 +11,19 @@ import msgspec
 import pytest
 
 import rmpa
+from rmpa.bridge.launched import ModuleResources
+from rmpa.bridge.log_ring import ModuleLog
+from rmpa.bridge.recordings import ModuleRecordings
 from rmpa.config.read import Loaded
 from rmpa.core.contract import ContractRule, Reliability
 from rmpa.core.errors import PeerRefused
-from rmpa.observe.control_client import ControlClient
+from rmpa.core.facts import ContractTerm, FollowedInfo
+from rmpa.observe.control_client import ControlClient, ReloadReply
 from rmpa.observe.graph import GraphRevision, TopicRow
-from rmpa.observe.operations import REPLIES
-from rmpa.observe.snapshot import ModuleFacts
-from rmpa.ros.environment import NodeFacts
+from rmpa.observe.snapshot import ModuleFacts, PingReply, Snapshot
+from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.ros.environment import NodeFacts, PeerNodes
+from rmpa.trust.permissions import TrustStatus
 from tests.agent.test_agent import DEADLINE, node, running
 
 if TYPE_CHECKING:
@@ -27,25 +32,26 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings
 
-ARGS: Final[dict[str, dict[str, Any]]] = {
-    "snapshot": {},
-    "ping": {"peer": "b"},
-    "why": {"name": "/chatter"},
-    "reload": {"check": True},
-    "param": {"peer": "b", "what": "param.names", "args": {}},
-    "followed": {},
-    "graph": {},
-    "trust": {"what": "status"},
-    "agent": {"peer": "b"},
-    "contract": {"topic": "/chatter", "type_name": "std_msgs/String"},
-    "log": {"modules": ["a", "b"], "level": "warn", "most": 5},
-    "log_level": {"peer": "b", "node": "/rmpa"},
-    "rates": {},
-    "launch": {"what": "list"},
-    "top": {},
-    "record": {"what": "list"},
-    "node": {"what": "node.list", "peer": "b"},
-    "site": {"what": "site.report", "args": {}},
+# All operations, each with its arguments and the type of its value; ``object``: it depends on the arguments.
+OPERATIONS: Final[dict[str, tuple[dict[str, Any], object]]] = {
+    "snapshot": ({}, Snapshot),
+    "ping": ({"peer": "b"}, PingReply),
+    "why": ({"name": "/chatter"}, tuple[Diagnosis, ...]),
+    "reload": ({"check": True}, ReloadReply),
+    "param": ({"peer": "b", "what": "param.names", "args": {}}, object),
+    "followed": ({}, tuple[FollowedInfo, ...]),
+    "graph": ({}, GraphRevision),
+    "trust": ({"what": "status"}, TrustStatus),
+    "agent": ({"peer": "b"}, ModuleFacts),
+    "contract": ({"topic": "/chatter", "type_name": "std_msgs/String"}, dict[str, ContractTerm]),
+    "log": ({"modules": ["a", "b"], "level": "warn", "most": 5}, tuple[ModuleLog, ...]),
+    "log_level": ({"peer": "b", "node": "/rmpa"}, dict[str, str]),
+    "rates": ({}, object),
+    "launch": ({"what": "list"}, tuple[ModuleResources, ...]),
+    "top": ({}, object),
+    "record": ({"what": "list"}, tuple[ModuleRecordings, ...]),
+    "node": ({"what": "node.list", "peer": "b"}, tuple[PeerNodes, ...]),
+    "site": ({"what": "site.report", "args": {}}, object),
 }
 
 
@@ -74,11 +80,12 @@ async def test_each_operation_replies_with_its_type_and_refuses_wrong_arguments(
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, _b):
         a.reloader._load = lambda: Loaded(settings("a"))
+        assert a.control._handlers.keys() == OPERATIONS.keys()
 
         def ask() -> list[str]:
             with ControlClient(tmp_path / "a.sock") as client:
-                for name, reply in REPLIES.items():
-                    client.call(name, cast("Any", reply), **ARGS[name])
+                for name, (given, reply) in OPERATIONS.items():
+                    client.call(name, cast("Any", reply), **given)
                 refused = []
                 for op, args, _ in WRONG:
                     with pytest.raises(PeerRefused) as error:
@@ -87,7 +94,6 @@ async def test_each_operation_replies_with_its_type_and_refuses_wrong_arguments(
             return refused
 
         refused = await asyncio.to_thread(ask)
-    assert REPLIES.keys() == ARGS.keys()
     assert [text for (_, _, text), said in zip(WRONG, refused, strict=True) if text not in said] == []
 
 

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from rmpa.cli import boot, machine
+from rmpa.cli import boot, units
 from rmpa.cli.boot import Former
-from rmpa.cli.machine import Machine
 from rmpa.cli.main import main
+from rmpa.cli.units import Machine
 from rmpa.config import module_name
 from rmpa.config.settings import Settings, TrustSettings
 from rmpa.core.errors import RmpaError, StartError
@@ -71,8 +71,8 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Systemd:
     place = tmp_path / "programs"
     place.mkdir()
     monkeypatch.setenv("PATH", f"{place}:{os.environ['PATH']}")
-    monkeypatch.setattr(machine, "_BOOTED", tmp_path)
-    for module in (boot, machine):
+    monkeypatch.setattr(units, "_BOOTED", tmp_path)
+    for module in (boot, units):
         monkeypatch.setattr(module, "own_program", lambda: "/opt/rmpa/bin/rmpa")
     return Systemd(place)
 
@@ -200,9 +200,9 @@ def test_purge_removes_a_state_directory_elsewhere(tmp_path: Path) -> None:
     (state / "base").mkdir(parents=True)
     for link in (image, place):
         link.symlink_to(state)
-    machine.remove_folder(image, "/image")  # there it leads to another folder
+    Machine("/image", dry=False).remove_folder(image)  # there it leads to another folder
     assert (image.is_symlink(), state.is_dir()) == (False, True)
-    machine.remove_folder(place, "")
+    Machine("", dry=False).remove_folder(place)
     assert (place.is_symlink(), state.exists()) == (False, False)
 
 
@@ -410,7 +410,7 @@ def test_what_it_needs_is_said_in_one_line(
     assert main(["service", "install", "--web"]) == 1
     problem = "rmpa: rmpa service install: only root may change the machine; sudo /opt/rmpa/bin/rmpa service install"
     assert capsys.readouterr().err == f"{problem} [root-needed]\n"
-    monkeypatch.setattr(machine, "_BOOTED", tmp_path / "none")
+    monkeypatch.setattr(units, "_BOOTED", tmp_path / "none")
     for verb in ("install", "status", "uninstall"):
         assert main(["service", verb]) == 1
         assert capsys.readouterr().err.startswith(

@@ -16,8 +16,9 @@ import msgspec
 import pytest
 
 from rmpa.cli import bug_report
+from rmpa.cli.bug_report import Redactor, is_secret
 from rmpa.cli.main import main
-from rmpa.cli.redact import Redactor, is_secret, without_passwords
+from rmpa.cli.output import without_passwords
 from rmpa.runtime.interpreter import own_command
 from tests.cli.conftest import Place
 from tests.observe.samples import SNAPSHOT

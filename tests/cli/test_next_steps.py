@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from rmpa.cli.advice import advises, next_steps
+from rmpa.cli.agent import advises, next_steps
 from rmpa.config.settings import Settings, WebSettings
 from rmpa.config.values import Multicast
 from rmpa.ros.environment import DEFAULT_MASTER_URI

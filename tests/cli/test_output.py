@@ -10,9 +10,22 @@ import pytest
 
 from rmpa.cli.graph import read_name
 from rmpa.cli.main import PlacedHelp, help_of
-from rmpa.cli.output import Painted, duration, print_error, print_text, printable, size, warn
+from rmpa.cli.output import (
+    Painted,
+    duration,
+    fill_stamps,
+    flatten,
+    pick,
+    print_error,
+    print_text,
+    printable,
+    read_values,
+    shorten,
+    size,
+    to_text,
+    warn,
+)
 from rmpa.cli.topic import facts
-from rmpa.cli.values import fill_stamps, flatten, pick, read_values, shorten, to_text
 from rmpa.core import errors
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.facts import RouteInfo

@@ -15,10 +15,10 @@ from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.facts import FollowedInfo
 from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.control import ReloadReply
-from rmpa.observe.peers import judge_refusal
+from rmpa.observe.control_client import ReloadReply
 from rmpa.observe.sites import SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.snapshot import PeerInfo, PingReply
+from rmpa.observe.snapshot_builder import judge_refusal
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.resource import limits
 from rmpa.ros.core.embedded import RosCore

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from rmpa.bridge.policy import PermissionGate
-from rmpa.cli import trust
+from rmpa.cli import module
 from rmpa.config.peer_rules import Access
 from rmpa.config.read import load_settings
 from rmpa.config.settings import Settings
@@ -53,7 +53,7 @@ def test_keys_of_the_service_take_sudo(place: Place, monkeypatch: pytest.MonkeyP
         raise StartError("/x/trust", "cannot be searched", "choose another state directory", code="keys-unusable")
 
     place.environ["RMPA_STATE_DIR"] = str(place.path)
-    monkeypatch.setattr(trust, "STATE", str(place.path))
+    monkeypatch.setattr(module, "STATE", str(place.path))
     monkeypatch.setattr(TrustStore, "exists", property(refuse))
     monkeypatch.setattr(os, "geteuid", lambda: uid)
     code, _, error = place.run("trust", "join", "rmpa1-secret", "--name", "arm")

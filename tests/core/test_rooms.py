@@ -25,9 +25,8 @@ ROOMS: Final = {
     "resource": ("resource", "cli/describe.py", "cli/profile.py", "cli/resource.py", "cli/run.py"),
     "doctor": ("observe/doctor", "cli/doctor.py"),
     "verbs": (
-        *("cli/advice.py", "cli/agent.py", "cli/boot.py", "cli/bug_report.py", "cli/core.py", "cli/init.py"),
-        *("cli/machine.py", "cli/messages.py", "cli/node.py", "cli/param.py", "cli/peer.py", "cli/service.py"),
-        *("cli/topic.py", "cli/trust.py", "cli/trust_join.py"),
+        *("cli/agent.py", "cli/boot.py", "cli/bug_report.py", "cli/core.py", "cli/init.py", "cli/messages.py"),
+        *("cli/node.py", "cli/param.py", "cli/peer.py", "cli/service.py", "cli/topic.py", "cli/trust.py"),
     ),
 }
 ALL: Final = [*itertools.chain(*ROOMS.values())]

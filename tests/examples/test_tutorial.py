@@ -16,8 +16,8 @@ from typing import Any, Final
 import pytest
 
 from lab.bed.processes import Process, eventually
+from rmpa.cli.output import read_values
 from rmpa.cli.run import load
-from rmpa.cli.values import read_values
 from rmpa.resource.quality import at_least, parse_requirement
 from tests.interop.ros import free_port
 

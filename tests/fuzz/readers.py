@@ -21,7 +21,7 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Refuse, judge, judge_welcome, parse_pong, parse_text, pong
-from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.control_client import ControlReply, ControlRequest
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros import limits
 from rmpa.ros.core.state import parse as parse_core_state

@@ -21,12 +21,12 @@ pytest.importorskip("cryptography")
 
 import rmpa
 from rmpa.bridge.messages import decode, encode
-from rmpa.cli.version import protocols
+from rmpa.cli.program import protocols
 from rmpa.config.module_name import NAME_FILE, PLACES_FILE, kept_name, other_state_dirs
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.gateway.sites.keys import AttachmentReader, parse_token
 from rmpa.mesh.frames import Frame, Hello, Lane, Refusal, Refuse
-from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.control_client import ControlReply, ControlRequest
 from rmpa.observe.snapshot import Snapshot
 from rmpa.resource.runtime import describe
 from rmpa.resource.saved import SavedCoolDown, SavedRequirement, SavedState

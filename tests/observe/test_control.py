@@ -14,7 +14,7 @@ from rmpa.core import facts
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.observe import limits
 from rmpa.observe import snapshot as s
-from rmpa.observe.control import ControlReply, ControlRequest, json_pieces
+from rmpa.observe.control_client import ControlReply, ControlRequest, json_pieces
 from rmpa.observe.snapshot import Snapshot
 from tests.observe.samples import SNAPSHOT, VIEWER
 

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from rmpa.discovery import limits
-from rmpa.observe.peers import ADDRESS_SHARED_MARGIN, mark_shared_addresses
 from rmpa.observe.snapshot import PeerInfo
+from rmpa.observe.snapshot_builder import ADDRESS_SHARED_MARGIN, mark_shared_addresses
 
 
 def peer(name: str, guid: str, state: str = "linking", since: float = 30.0, beacon: float | None = 2.0) -> PeerInfo:

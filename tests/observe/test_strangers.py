@@ -6,7 +6,7 @@ import pytest
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery.packet_filter import Stranger
-from rmpa.observe.peers import judge_refusal, judge_stranger, judge_strangers
+from rmpa.observe.snapshot_builder import judge_refusal, judge_stranger, judge_strangers
 from rmpa.trust.permissions import MemberInfo, TrustReason, TrustStatus
 
 MEMBER = TrustStatus(on=True, module="pc", authority="base", revoked=("old", "back"))

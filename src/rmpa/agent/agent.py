@@ -44,7 +44,7 @@ from rmpa.observe.health import Diagnostics
 from rmpa.observe.operations import ControlOperations
 from rmpa.observe.sites import SiteRequests
 from rmpa.observe.snapshot import INFO
-from rmpa.observe.snapshot_builder import AgentParts, SnapshotBuilder
+from rmpa.observe.snapshot_builder import SnapshotBuilder
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
@@ -439,7 +439,8 @@ class Agent:
         self.other_notes: list[Callable[[], Iterable[str]]] = []
         counters = Counters()
         self._facts = facts = BridgeFacts(self.bridge, self.services, subscriptions, twins)
-        parts = AgentParts(
+        self.snapshots = SnapshotBuilder(
+            settings,
             core=self.core,
             facts=facts,
             endpoint=lambda: (at.identity, at.mesh, at.discovery) if (at := self.network.endpoint) else None,
@@ -449,7 +450,6 @@ class Agent:
             trust=self.trust.status if self.trust is not None else lambda: None,
             restart=lambda: restart_to_join(settings) if self.trust is None else "",
         )
-        self.snapshots = SnapshotBuilder(settings, parts)
         needs = Needs((), "the agent and its machine, nothing of the module's graph")
         self.bridge.rpc.on_request(INFO, lambda _asker, _args: self.snapshots.agent().for_peers(), needs)
         self.sites = SiteRequests(self.bridge)

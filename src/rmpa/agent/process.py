@@ -20,8 +20,7 @@ from rmpa import __version__
 from rmpa.config.settings import SETTINGS
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.timers import Backoff
-from rmpa.observe.control import ReloadReply
-from rmpa.observe.control_client import runtime_dir
+from rmpa.observe.control_client import ReloadReply, runtime_dir
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import realtime
 from rmpa.runtime.accept import is_shortage, open_files_advice, raise_file_limit

@@ -14,18 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.machine import (
-    UNIT_FOLDER,
-    Machine,
-    check_machine,
-    copy_state,
-    entries,
-    modules_in,
-    own_program,
-    refused,
-    remove_folder,
-)
-from rmpa.cli.options import Options, flag, json_verb
+from rmpa.cli.options import Options, flag, json_verb, option
 from rmpa.cli.output import confirm
 from rmpa.cli.units import (
     CONFIG,
@@ -34,24 +23,31 @@ from rmpa.cli.units import (
     PACKAGED,
     RUNTIME,
     STATE,
+    UNIT_FOLDER,
     UNITS,
     USER,
+    Machine,
     config_text,
+    copy_state,
     drop_in_text,
+    own_program,
+    refused,
     unit_texts,
 )
 from rmpa.config.module_name import (
     GATEWAY_SUFFIX,
+    PLACES_FILE,
     NameSource,
     choose_name,
     keep_name,
     kept_name,
+    module_dir,
     state_dir,
 )
 from rmpa.config.read import load_settings, parse_config
 from rmpa.config.settings import Settings
 from rmpa.config.toml_file import line_of
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.identity import peer_name_from, peer_name_problem
 from rmpa.runtime.systemd import INSTALL, is_set_up
 
@@ -64,16 +60,16 @@ if TYPE_CHECKING:
 _MARK: Final = "# Made by `rmpa service install`; changes belong into a drop-in: systemctl edit {unit}\n"
 # Behind the name of a unit that was written by hand, and is kept beside ours.
 _BY_HAND: Final = ".by-hand"
-# What `systemctl show` is asked for.
-_PROPERTIES: Final = (
-    *("LoadState", "ActiveState", "SubState", "UnitFileState", "Result", "MainPID", "NRestarts"),
-    "StateChangeTimestampMonotonic",
-    "FragmentPath",
-)
 # The states of a unit that does nothing, or is not there.
 _AWAY: Final = ("inactive", "unknown")
-# Lines of a unit's log that are shown.
-_LOG_LINES: Final = 5
+# The accounts of the units, in the order in which they are made, with the words of ``groupadd`` and ``useradd``.
+_ACCOUNTS: Final = (
+    ("group", GROUP, ("--system", GROUP)),
+    (
+        *("user", USER),
+        ("--system", "--gid", GROUP, "--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin", USER),
+    ),
+)
 # A user without any rights of its own: what it cannot run, the unit's user cannot either.
 _NOBODY: Final = 65534
 
@@ -115,7 +111,7 @@ def former(environ: Mapping[str, str], root: str = "") -> Former:
     return Former(
         user.pw_name,
         config if config is not None and str(config) != CONFIG else None,
-        state if state is not None and str(state) != STATE and entries(state) else None,
+        state if state is not None and str(state) != STATE and _entries(state) else None,
         chosen.name if chosen.source is not NameSource.DEFAULT else "",
         loaded.settings,
     )
@@ -151,14 +147,14 @@ def _runs_as(program: str, uid: int, gid: int) -> bool:
 
 
 @json_verb(
-    flag("--web", help="The web server too: rmpa web, in a unit of its own."),
-    flag("--gateway", help="The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
-    flag("--realtime", help="Let the agent have real-time priority and locked memory."),
-    flag("--resources", help="Let nodes that the agent starts use devices, and go on without it."),
-    click.option("--name", metavar="NAME", help="The module's name. [default: the one that it has had]"),
-    click.option("--user", metavar="NAME", help="The user that the units run as. [default: rmpa, which is made]"),
-    flag("--dry-run", help="Change nothing; say what would be done, and print the units."),
-    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+    flag("--web", "The web server too: rmpa web, in a unit of its own."),
+    flag("--gateway", "The gateway too, with [gateway] of /etc/rmpa/rmpa.toml."),
+    flag("--realtime", "Let the agent have real-time priority and locked memory."),
+    flag("--resources", "Let nodes that the agent starts use devices, and go on without it."),
+    option("--name", "NAME", "The module's name. [default: the one that it has had]"),
+    option("--user", "NAME", "The user that the units run as. [default: rmpa, which is made]"),
+    flag("--dry-run", "Change nothing; say what would be done, and print the units."),
+    option("--root", "DIR", "The folder of another system, such as an image.", default=""),
 )
 def service_install(
     web: bool,
@@ -190,13 +186,14 @@ def service_install(
       rmpa service install --dry-run               what would be done?
       sudo rmpa service install --root /mnt/image  for a machine that is not running
     """
-    machine = _machine("install", root, options, dry=dry_run)
-    root = machine.root
+    root = root.rstrip("/")
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    machine.check("install")
     if name and (problem := peer_name_problem(name)):
         raise ConfigError("--name", problem)
     program = own_program()
     before = former(os.environ, root)
-    packaged = program == PACKAGED and machine.packaged
+    packaged = program == PACKAGED and machine.has_packaged()
     if packaged and user:
         raise ConfigError("--user", "the package's units have the user rmpa", "change it by: systemctl edit rmpa")
     wanted = [UNITS["up"], *([UNITS["web"]] if web else []), *([UNITS["gateway"]] if gateway else [])]
@@ -210,29 +207,22 @@ def service_install(
     if user is None:
         user = USER if root or packaged else choose_user(program)
         if user != USER:
-            machine.note(f"the units run as {user}: no other user can run {program}")
-    _make_user(machine, user)
+            machine.tell(f"the units run as {user}: no other user can run {program}")
+    _make_accounts(machine, user)
     _make_config(machine, before)
     renamed = _take_over(machine, before, user, name)
     # Units that were made for another program would hide the package's.
     changed = _remove_made(machine, UNITS.values()) if packaged else _write_units(machine, wanted, program, user)
-    for option in (*(["realtime"] if realtime else []), *(["resources"] if resources else [])):
-        if machine.write(f"{UNIT_FOLDER}/{DROP_INS[option]}", drop_in_text(option, _MARK.format(unit=UNITS["up"]))):
+    for way in [*(["realtime"] if realtime else []), *(["resources"] if resources else [])]:
+        if machine.write(f"{UNIT_FOLDER}/{DROP_INS[way]}", drop_in_text(way, _MARK.format(unit=UNITS["up"]))):
             changed.append(UNITS["up"])
     if renamed:
         changed.extend(wanted)
     _start(machine, wanted, changed)
     if not (dry_run or root):
-        machine.note("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
+        machine.tell("it runs, now and at boot: `rmpa service status`; its log: journalctl -u rmpa")
     options.show({"units": wanted, "user": user, "changes": machine.changes, "dry_run": dry_run})
     return 0
-
-
-def _machine(verb: str, root: str, options: Options, *, dry: bool) -> Machine:
-    """The machine that a verb changes, once it is known that it can be changed."""
-    root = root.rstrip("/")
-    check_machine(root, verb, dry=dry)
-    return Machine(root, dry=dry, tell=(lambda _: None) if options.as_json else click.echo)
 
 
 def _check_name(machine: Machine, before: Former, name: str) -> None:
@@ -270,7 +260,7 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
             raise ConfigError("--web", "[web] enabled = true in rmpa.toml has the agent start it", "choose one")
     if gateway:
         check_gateway(settings)
-    if machine.root or settings.core_mode != "embedded" or _shown(UNITS["up"]).get("ActiveState") == "active":
+    if machine.root or settings.core_mode != "embedded" or machine.shown(UNITS["up"]).get("ActiveState") == "active":
         return
     from rmpa.runtime.kernel_tcp import program_at
 
@@ -278,27 +268,23 @@ def _check_parts(machine: Machine, before: Former, *, web: bool, gateway: bool) 
         problem = f"{holder} has port {settings.core_port}, which the agent's core needs"
         if not machine.dry:
             raise refused("install", problem, "end it first")
-        machine.note(f"! {problem}: end it first")
+        machine.tell(f"! {problem}: end it first")
 
 
-def _make_user(machine: Machine, user: str) -> None:
-    below = ["--prefix", machine.root] if machine.root else []
-    if machine.number("group", GROUP) is None:
-        machine.run(f"make the group {GROUP}", "groupadd", *below, "--system", GROUP)
-    if user != USER:
-        if not machine.root and machine.number("passwd", user) is None:
-            raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
-        return
-    if machine.ids(user) is None:
-        home = ["--home-dir", STATE, "--no-create-home", "--shell", "/usr/sbin/nologin"]
-        machine.run(f"make the user {user}", "useradd", *below, "--system", "--gid", GROUP, *home, user)
+def _make_accounts(machine: Machine, user: str) -> None:
+    for kind, name, words in _ACCOUNTS:
+        if kind == "user" and user != USER:
+            if not machine.root and machine.number(kind, user) is None:
+                raise ConfigError("--user", f"there is no user {user}", "leave it out, and the user rmpa is made")
+        elif machine.number(kind, name) is None:
+            machine.run(f"make the {kind} {name}", f"{kind}add", *words)
 
 
 def _make_config(machine: Machine, before: Former) -> None:
     if machine.path(CONFIG).exists():
-        machine.note(f"{CONFIG} stays as it is")
+        machine.tell(f"{CONFIG} stays as it is")
         if before.config is not None:
-            machine.note(f"! {before.config} is not read by the units")
+            machine.tell(f"! {before.config} is not read by the units")
         return
     text, source = config_text(), "every setting in a comment"
     if before.config is not None:
@@ -307,6 +293,35 @@ def _make_config(machine: Machine, before: Former) -> None:
         machine.path(CONFIG).parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         machine.path(CONFIG).write_text(text, "utf-8")
         machine.path(CONFIG).chmod(0o644)
+
+
+def _entries(state: Path) -> list[Path]:
+    """What a state directory keeps of modules."""
+    return sorted(path for path in state.glob("*") if path.name != PLACES_FILE)
+
+
+def _modules_in(state: Path, module: str, *, insecure: bool) -> tuple[dict[str, str], list[str]]:
+    """The folders of a state directory: those of a module and its gateway, with what is said of them; and others.
+
+    Args:
+        state: The directory.
+        module: The module.
+        insecure: Whether it may be without keys although others have some.
+
+    Raises:
+        StartError: It may not.
+    """
+    wanted = {module_dir(state, each) for each in (module, module + GATEWAY_SUFFIX)}
+    folders = [path for path in _entries(state) if path.is_dir() and not path.is_symlink()]
+    keys = {path: (path / "trust").is_dir() for path in folders}
+    others = [path.name for path in folders if path not in wanted]
+    secured = [path.name for path in folders if keys[path] and path not in wanted]
+    if secured and not keys.get(module_dir(state, module)) and not insecure:
+        problem = f"it has no keys in {state}, but {', '.join(secured)} has"
+        remedy = f"install that one, --name {secured[0]}; or first: rmpa trust join --name {module} TOKEN"
+        raise StartError(f"the module {module}", problem, remedy, code="keys-unusable")
+    ours = [path for path in folders if path in wanted]
+    return {path.name: f"{path.name}/{' with keys of a secured mesh' if keys[path] else ''}" for path in ours}, others
 
 
 def _take_over(machine: Machine, before: Former, user: str, name: str | None) -> bool:
@@ -318,13 +333,13 @@ def _take_over(machine: Machine, before: Former, user: str, name: str | None) ->
     place = machine.path(STATE)
     kept = kept_name(place)
     ids = None if machine.dry or os.geteuid() else machine.ids(user)
-    if entries(place):
-        machine.note(f"{STATE} stays as it is")
+    if _entries(place):
+        machine.tell(f"{STATE} stays as it is")
     elif before.state is not None:
         module = name or kept_name(before.state) or before.name or peer_name_from(socket.gethostname())
-        ours, others = modules_in(before.state, module, insecure=before.settings.trust.insecure)
+        ours, others = _modules_in(before.state, module, insecure=before.settings.trust.insecure)
         if others:
-            machine.note(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
+            machine.tell(f"what other modules have kept stays in {before.state}: {', '.join(others)}")
         if ours or not others:
             kept = kept_name(before.state)
             what = ", ".join([*([f"the name {kept}"] if kept else []), *ours.values()])
@@ -346,7 +361,7 @@ def _write_units(machine: Machine, wanted: Sequence[str], program: str, user: st
     """Write the units; return those whose text has changed. One that was written by hand is renamed, not replaced."""
     texts = unit_texts(program, user)
     for unit in wanted:
-        path = machine.path(f"{UNIT_FOLDER}/{unit}")
+        path = machine.unit(unit)
         old = f"{unit}{_BY_HAND}"
         if path.is_file() and not _is_made(path) and machine.change(f"rename {UNIT_FOLDER}/{unit} to {old}"):
             path.rename(path.with_name(old))
@@ -365,9 +380,9 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
     if changed:
         machine.systemctl("daemon-reload")
     for unit in wanted:
-        now = _shown(unit)
+        now = machine.shown(unit)
         if now.get("ActiveState") == "active" and now.get("UnitFileState") == "enabled" and unit not in changed:
-            machine.note(f"{unit} runs")
+            machine.tell(f"{unit} runs")
             continue
         again = now.get("ActiveState") == "active"
         try:
@@ -375,27 +390,8 @@ def _start(machine: Machine, wanted: Sequence[str], changed: Sequence[str]) -> N
             if again:
                 machine.systemctl("restart", unit)
         except RmpaError as error:
-            text = "\n".join([str(error), *(f"  {line}" for line in _log(unit))])
+            text = "\n".join([str(error), *(f"  {line}" for line in machine.log(unit))])
             raise RmpaError(text, code="service-unit") from None
-
-
-def _shown(unit: str) -> dict[str, str]:
-    """What ``systemctl show`` says of a unit; empty where it says nothing."""
-    lines = _said("systemctl", "show", unit, f"--property={','.join(_PROPERTIES)}")
-    return dict(line.partition("=")[::2] for line in lines)
-
-
-def _log(unit: str) -> list[str]:
-    """The last lines of a unit's log; empty for a user who may not read it."""
-    return _said("journalctl", "--quiet", "--no-pager", "--output=cat", f"--lines={_LOG_LINES}", f"--unit={unit}")
-
-
-def _said(*command: str) -> list[str]:
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    except OSError:
-        return []
-    return done.stdout.splitlines()
 
 
 @json_verb()
@@ -409,8 +405,9 @@ def service_status(options: Options) -> int:
       rmpa service status
       rmpa service status --json | jq .units
     """
-    check_machine("", "status", dry=True)
-    states = [_state(name) for name in UNITS.values()]
+    machine = Machine("", dry=True)
+    machine.check("status")
+    states = [_state(machine, name) for name in UNITS.values()]
     # A package has all units, of which web server and gateway may be of no use here.
     units = [states[0], *(state for state in states[1:] if state["enabled"] or state["active"] not in _AWAY)]
     peers, waiting, problem = _peers() if units[0]["active"] == "active" else ([], "", "")
@@ -429,8 +426,8 @@ def service_status(options: Options) -> int:
     return 0 if units[0]["active"] == "active" else 1
 
 
-def _state(unit: str) -> dict[str, object]:
-    shown = _shown(unit)
+def _state(machine: Machine, unit: str) -> dict[str, object]:
+    shown = machine.shown(unit)
     since = int(shown.get("StateChangeTimestampMonotonic") or 0) / 1e6
     installed = shown.get("LoadState") == "loaded"
     return {
@@ -444,7 +441,7 @@ def _state(unit: str) -> dict[str, object]:
         "result": shown.get("Result", ""),
         "pid": int(shown.get("MainPID") or 0) or None,
         "restarts": int(shown.get("NRestarts") or 0),
-        "log": _log(unit) if installed else [],
+        "log": machine.log(unit) if installed else [],
     }
 
 
@@ -495,12 +492,10 @@ def _peers() -> tuple[list[tuple[str, str]], str, str]:
 
 
 @json_verb(
-    flag(
-        "--purge", help="Remove settings and state too, and the user rmpa: the module's name and keys are then lost."
-    ),
-    flag("--yes", help="Do not ask."),
-    flag("--dry-run", help="Change nothing; say what would be done."),
-    click.option("--root", metavar="DIR", default="", help="The folder of another system, such as an image."),
+    flag("--purge", "Remove settings and state too, and the user rmpa: the module's name and keys are then lost."),
+    flag("--yes", "Do not ask."),
+    flag("--dry-run", "Change nothing; say what would be done."),
+    option("--root", "DIR", "The folder of another system, such as an image.", default=""),
 )
 def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options: Options) -> int:
     """Stop rmpa, disable it at boot, and remove what `rmpa service install` has made.
@@ -515,33 +510,34 @@ def service_uninstall(purge: bool, yes: bool, dry_run: bool, root: str, options:
       sudo rmpa service uninstall --purge --yes   in a script
       rmpa service uninstall --dry-run
     """
-    machine = _machine("uninstall", root, options, dry=dry_run)
-    root = machine.root
-    if purge and machine.packaged:
+    root = root.rstrip("/")
+    machine = Machine(root, dry=dry_run, tell=(lambda _: None) if options.as_json else click.echo)
+    machine.check("uninstall")
+    if purge and machine.has_packaged():
         raise refused("uninstall", "the package has settings and state", "sudo apt purge rmpa")
     if purge and not (yes or dry_run) and not confirm(f"Remove {CONFIG} and all of {STATE}, keys too?"):
         raise ConfigError("rmpa service uninstall", "nothing was removed", code="not-confirmed")
-    units = ((unit, machine.path(f"{UNIT_FOLDER}/{unit}")) for unit in UNITS.values())
+    units = ((unit, machine.unit(unit)) for unit in UNITS.values())
     # One that was written by hand stays.
     parts = [unit for unit, path in units if (_is_made(path) if path.is_file() else machine.has_packaged(unit))]
     if parts:
         machine.systemctl("disable", *([] if root else ["--now"]), *parts)
     removed = _remove_made(machine, (*UNITS.values(), *DROP_INS.values()))
     for unit in removed:
-        old = machine.path(f"{UNIT_FOLDER}/{unit}{_BY_HAND}")
+        old = machine.unit(f"{unit}{_BY_HAND}")
         if old.is_file() and machine.change(f"rename {UNIT_FOLDER}/{old.name} to {unit}"):
             old.rename(old.with_name(unit))
     if removed and not root:
         machine.systemctl("daemon-reload")
     if purge:
         _purge(machine)
-    elif not machine.packaged:
+    elif not machine.has_packaged():
         stays = [each for each in (CONFIG, STATE) if machine.path(each).exists()]
         stays += [f"the user {USER}"] if machine.ids(USER) is not None else []
         if stays:
-            machine.note(f"{', '.join(stays)} stay; they go by: rmpa service uninstall --purge")
+            machine.tell(f"{', '.join(stays)} stay; they go by: rmpa service uninstall --purge")
     if not machine.changes:
-        machine.note("nothing is installed")
+        machine.tell("nothing is installed")
     options.show({"units": parts, "changes": machine.changes, "dry_run": dry_run})
     return 0
 
@@ -555,7 +551,7 @@ def _remove_made(machine: Machine, places: Iterable[str]) -> list[str]:
     """Remove those of some files in the folder of units that ``install`` has made; return which."""
     found = []
     for place in places:
-        path = machine.path(f"{UNIT_FOLDER}/{place}")
+        path = machine.unit(place)
         if path.is_file() and _is_made(path):
             found.append(place)
             if machine.change(f"remove {UNIT_FOLDER}/{place}"):
@@ -573,9 +569,7 @@ def _purge(machine: Machine) -> None:
             config.parent.rmdir()
     for place in (state, machine.path(RUNTIME)):
         if place.is_dir() and machine.change(f"remove {str(place).removeprefix(machine.root)}"):
-            remove_folder(place, machine.root)
-    below = ["--prefix", machine.root] if machine.root else []
-    if machine.ids(USER) is not None:
-        machine.run(f"remove the user {USER}", "userdel", *below, USER)
-    if machine.number("group", GROUP) is not None:
-        machine.run(f"remove the group {GROUP}", "groupdel", *below, GROUP)
+            machine.remove_folder(place)
+    for kind, name, _ in reversed(_ACCOUNTS):
+        if machine.number(kind, name) is not None:
+            machine.run(f"remove the {kind} {name}", f"{kind}del", name)

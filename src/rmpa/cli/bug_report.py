@@ -1,4 +1,8 @@
-"""``rmpa bug-report``: what a maintainer needs to know of this machine, in one archive, redacted."""
+"""``rmpa bug-report``: what a maintainer needs to know of this machine, in one archive, redacted.
+
+``Redactor`` takes out of texts what no other person is to see: keys, tokens, passwords, users and their homes. Hosts,
+modules and addresses can be replaced too, each by the same word wherever it stands.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +17,20 @@ import socket
 import sys
 import tarfile
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from ipaddress import ip_address
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import click
 import msgspec
 
-from rmpa.cli.options import Options, config_option, flag, json_verb
-from rmpa.cli.output import Table, print_text, size
-from rmpa.cli.redact import Redactor, is_secret
+from rmpa.cli.options import Options, config_option, flag, json_verb, option
+from rmpa.cli.output import GONE, USER_INFO, Table, print_text, size
 from rmpa.cli.units import UNITS
 from rmpa.config.module_name import of_unit, state_dir
 from rmpa.config.read import VARIABLES, find_config_file
@@ -36,7 +41,7 @@ from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.runtime.interpreter import own_command
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
 
 # By its file: the command of rmpa that fills it. Those of an agent are asked of each.
@@ -88,9 +93,9 @@ Files that could not be filled say why.
 
 @json_verb(
     config_option,
-    click.option("-o", "--output", metavar="PATH", help="A .tar.gz, else a folder. [default: a .tar.gz here]"),
-    click.option("--log", metavar="FILE", type=click.Path(exists=True, dir_okay=False), help="A log of rmpa up."),
-    flag("--anonymous", help="Replace names of hosts and modules, and addresses, each by one word."),
+    option("-o --output", "PATH", "A .tar.gz, else a folder. [default: a .tar.gz here]"),
+    option("--log", "FILE", "A log of rmpa up.", type=click.Path(exists=True, dir_okay=False)),
+    flag("--anonymous", "Replace names of hosts and modules, and addresses, each by one word."),
 )
 def bug_report(config: str | None, output: str | None, log: str | None, anonymous: bool, options: Options) -> int:
     """Collect what a maintainer needs into one archive: versions, doctor, lists, settings, the end of the log.
@@ -312,3 +317,152 @@ def _write_archive(path: Path, folder: str, files: Mapping[str, bytes]) -> None:
             info = tarfile.TarInfo(f"{folder}/{name}")  # it has no user's name
             info.size, info.mtime = len(data), int(time.time())
             archive.addfile(info, io.BytesIO(data))
+
+
+# Every pattern takes a time linear in the text: it starts where no word goes on, or its repeats are bounded.
+_LINE: Final = 4096
+_LONG: Final = re.compile(rf"(?m)^(?=.{{{_LINE + 1}}})(.{{0,{_LINE - 1}}}\s|)(.*)$")  # cut between words
+_TO_THE_END: Final = r"passw|passphrase|pwd|psk|authorization|cookie"  # their values may have blanks
+_OTHERS: Final = (
+    r"secret|token|credential|(?:api|private|access|shared)key|[-_]key(?![a-z])|auth(?![a-z])"
+    r"|(?<!com)(?<!by)pass(?![a-z])|(?<![a-z])pw(?![a-z])"
+)
+_WORDS: Final = f"{_TO_THE_END}|{_OTHERS}"
+_IS_SECRET: Final = re.compile(_WORDS, re.IGNORECASE)
+# Names of files and the like: that they hold a secret does not make them one.
+_IS_PLACE: Final = re.compile(r"(file|path|dir|folder)s?$", re.IGNORECASE)
+_QUOTED: Final = r"\\?\"(?:[^\"\\\n]|\\.){0,200}\"|'[^'\n]{0,200}'"
+_NAME: Final = r"[\w.-]{0,60}(?<!file)(?<!path)(?<!dir)(?<!folder)"
+_IS: Final = r"\\?[\"']?[ \t]{0,9}[:=][ \t]{0,9}"
+
+
+def is_secret(key: str) -> bool:
+    """Whether the value of a variable or key is likely to be a secret."""
+    return bool(_IS_SECRET.search(key)) and not _IS_PLACE.search(key)
+
+
+def _value_of(match: re.Match[str]) -> str:
+    key, between, _ = match.groups()
+    return f"{key}{between}{GONE}" if is_secret(key) else match[0]
+
+
+# What is counted, the pattern, and what takes its place.
+_Rule: TypeAlias = "tuple[str, re.Pattern[str], str | Callable[[re.Match[str]], str]]"
+_RULES: Final[tuple[_Rule, ...]] = (
+    ("private keys", re.compile(r"(?s)-----BEGIN ([A-Z0-9 ]{1,40})-----.*?(?:-----END \1-----|\Z)"), GONE),
+    ("ends of long lines", _LONG, lambda m: f"{m[1]}[{len(m[2])} characters cut]"),
+    ("users and passwords of addresses", USER_INFO, rf"\1{GONE}@"),
+    ("tokens", re.compile(r"(?i)\brmpa1-[a-z2-7]{8,}|(?<=bearer )[\w.~+/=-]{6,}|(?<=basic )[\w.~+/=-]{6,}"), GONE),
+    # As base64 has it, and the hexadecimal digits of a key. Those of md5 (a type's) and of a commit stay.
+    ("random texts", re.compile(r"(?<![\w+-])(?=[\w+-]*\d)(?=[\w+-]*[a-z])(?=[\w+-]*[A-Z])[\w+-]{40,}={0,2}"), GONE),
+    ("random texts", re.compile(r"(?<![0-9a-fA-F])(?!(?:\w{32}|\w{40})\b)[0-9a-fA-F]{32,}"), GONE),
+    *(
+        (
+            "values of secret names",
+            re.compile(rf"(?i)({begin}(?:{words}){_NAME})({between})({_QUOTED}|{value})"),
+            _value_of,
+        )
+        for begin, words, between, value in (
+            ("", _TO_THE_END, _IS, ".+"),
+            ("", _OTHERS, _IS, r"\S+"),
+            (r"(?<![\w-])--[\w-]{0,60}", _WORDS, r"\s{1,9}", r"\S+"),  # --token …
+            (r"\b", "password|passphrase", r"[ \t]{1,9}(?:(?:is|was)[ \t]{1,9})?", r"\S+"),  # the password …
+        )
+    ),
+)
+_HOME: Final = re.compile(r"/(?:home|Users)/[^/\s\"':;,\])}]+|/root(?![\w-])")
+_HOST: Final = re.compile(r"(?<=://)[A-Za-z][\w.-]*")
+_ADDRESS: Final = re.compile(
+    r"(?<![\w.])(?:\d{1,3}\.){3}\d{1,3}(?![\w.])|(?<![\w:])[0-9a-fA-F]{0,4}(?::[0-9a-fA-F]{0,4}){2,7}(?![\w:])"
+)
+_MAC: Final = re.compile(r"(?<![\w:])(?:[0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}(?![\w:])")
+# Users' names that name no person: that of a service, or of many images.
+_NO_PERSON: Final = frozenset({"root", "rmpa", "nobody", "user", "admin", "pi", "ubuntu", "ros", "robot"})
+
+
+class Redactor:
+    """Redacts texts, and counts what it has taken out.
+
+    Args:
+        secrets: Texts that are secrets, wherever they stand.
+        homes: Home directories.
+        users: Names of users.
+
+    Attributes:
+        counts: How many were taken out, by what they are.
+        aliases: The word for each host, module and address; empty: they stay.
+    """
+
+    def __init__(self, secrets: Iterable[str] = (), homes: Iterable[str] = (), users: Iterable[str] = ()) -> None:
+        self._rules: list[_Rule] = [
+            ("secrets of this machine", _any_of(secret for secret in secrets if len(secret) > 5), GONE),
+            *_RULES,
+            ("home directories", _any_of(home for home in homes if home not in ("", "/")), "~"),
+            ("home directories", _HOME, "~"),
+            ("user names", _words(user for user in users if user not in _NO_PERSON), "[user]"),
+        ]
+        self.counts: Counter[str] = Counter()
+        self.aliases: dict[str, str] = {}
+
+    def anonymise(self, texts: Iterable[str], hosts: Iterable[str], modules: Iterable[str]) -> None:
+        """Give hosts, modules and addresses of these texts other names from now on."""
+        texts = list(texts)
+        found = [match for text in texts for match in _HOST.findall(text)]
+        for kind, names in (("host", [*hosts, *found]), ("module", modules)):
+            for number, name in enumerate(sorted({*names} - {"", "localhost", *self.aliases}), 1):
+                self.aliases[name] = f"{kind}-{number}"
+        named = _words(self.aliases)
+        addresses = {each for text in texts for pattern in (_MAC, _ADDRESS) for each in pattern.findall(text)}
+        self.aliases |= {each: f"address-{n}" for n, each in enumerate(filter(_is_telling, sorted(addresses)), 1)}
+        for pattern in (_MAC, _ADDRESS, named):
+            self._rules.append(("hosts and addresses", pattern, lambda match: self.aliases.get(match[0], match[0])))
+
+    def text(self, text: str) -> str:
+        """A text without what is not to be seen."""
+        for what, pattern, by in self._rules:
+            text = self._swap(what, pattern, by, text)
+        return text
+
+    def value(self, value: object, key: str = "") -> object:
+        """A value as JSON has it, likewise; ``key`` is its name."""
+        if isinstance(value, dict):
+            return {self.text(str(name)): self.value(each, str(name)) for name, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [self.value(each, key) for each in value]
+        if not isinstance(value, str):
+            return value
+        if value and is_secret(key):
+            self.counts["values of secret names"] += 1
+            return GONE
+        return self.text(value)
+
+    def _swap(self, what: str, pattern: re.Pattern[str], by: str | Callable[[re.Match[str]], str], text: str) -> str:
+        count = 0
+
+        def swapped(match: re.Match[str]) -> str:
+            nonlocal count
+            new = by(match) if callable(by) else match.expand(by)
+            count += new != match[0]
+            return new
+
+        text = pattern.sub(swapped, text)
+        self.counts[what] += count
+        return text
+
+
+def _is_telling(text: str) -> bool:
+    """Whether an address tells anything of a network."""
+    try:
+        address = ip_address(text)
+    except ValueError:
+        return bool(_MAC.fullmatch(text))
+    return not (address.is_loopback or address.is_unspecified or address.is_multicast or text.startswith("255."))
+
+
+def _any_of(texts: Iterable[str]) -> re.Pattern[str]:
+    """Matches each of some texts, the longest first; nothing where there is none."""
+    return re.compile("|".join(map(re.escape, sorted({*texts}, key=len, reverse=True))) or "(?!)")
+
+
+def _words(texts: Iterable[str]) -> re.Pattern[str]:
+    return re.compile(rf"(?<![A-Za-z0-9_])(?:{_any_of(filter(None, texts)).pattern})(?![A-Za-z0-9_])")

@@ -11,7 +11,7 @@ import sys
 import click
 
 from rmpa.cli.main import verb
-from rmpa.cli.options import flag
+from rmpa.cli.options import flag, option
 from rmpa.cli.output import print_text
 from rmpa.core.errors import UnreachableError
 
@@ -29,30 +29,27 @@ def _default_port() -> int:
 
 
 @verb(
-    click.option(
-        "-p",
-        "--port",
-        type=click.IntRange(0, 65535),
+    option(
+        "-p --port",
         help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
+        type=click.IntRange(0, 65535),
     ),
-    click.option(
+    option(
         "--host",
+        help="Address to listen at; 0.0.0.0 opens it to the network.",
         default="127.0.0.1",
         show_default=True,
-        help="Address to listen at; 0.0.0.0 opens it to the network.",
     ),
-    click.option(
-        "--advertise", default="", metavar="NAME", help="Host name or address that nodes are given, if not --host."
-    ),
-    click.option(
+    option("--advertise", "NAME", "Host name or address that nodes are given, if not --host.", default=""),
+    option(
         "--keep",
+        help="Restore nodes and parameters of the last run: auto, if one of its nodes runs or the core crashed.",
         type=click.Choice(["auto", "always", "never"]),
         default="auto",
         show_default=True,
-        help="Restore nodes and parameters of the last run: auto, if one of its nodes runs or the core crashed.",
     ),
-    flag("-v", "--verbose", help="Log every registration."),
-    flag("--debug", help="Log every call."),
+    flag("-v --verbose", "Log every registration."),
+    flag("--debug", "Log every call."),
 )
 def core(port: int | None, host: str, advertise: str, keep: str, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""

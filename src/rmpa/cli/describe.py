@@ -5,21 +5,16 @@ from __future__ import annotations
 import asyncio
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
-import msgspec
 
-from rmpa.cli.completion import nodes
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, unknown_name, with_node
+from rmpa.cli.graph import GraphName, read_name, unknown_name
 from rmpa.cli.main import verb
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb
+from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, nodes, option, output_option
 from rmpa.cli.output import printable
-from rmpa.core.errors import RmpaError, StartError
+from rmpa.core.errors import StartError
 from rmpa.core.identity import proxied_node
-from rmpa.ros.environment import NodeFacts, describe_node
-from rmpa.ros.http.rpc import call_api
-from rmpa.ros.node.ask import ping_node
 
 if TYPE_CHECKING:
     from rmpa.resource.checking import Misfit
@@ -27,16 +22,15 @@ if TYPE_CHECKING:
     from rmpa.resource.resource import Resource
     from rmpa.ros.node.node import Node
 
-_CALLER_ID: Final = "/rmpa_resource"
-_seconds = click.option(
-    "--seconds", type=FiniteRange(0.5, 60.0), default=3.0, show_default=True, help="How long it looks at the node."
+_seconds = option(
+    "--seconds", help="How long it looks at the node.", type=FiniteRange(0.5, 60.0), default=3.0, show_default=True
 )
 
 
 @graph_verb(
     argument("node", nodes),
-    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write it there."),
-    flag("--force", help="Replace the file that is there."),
+    output_option("Write it there."),
+    flag("--force", "Replace the file that is there."),
     _seconds,
 )
 def resource_describe(node: str, output: Path | None, force: bool, seconds: float, options: Options) -> None:
@@ -77,7 +71,7 @@ def resource_describe(node: str, output: Path | None, force: bool, seconds: floa
 
 @graph_verb(
     argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path)),
-    flag("--offline", help="The file alone, without a graph."),
+    flag("--offline", "The file alone, without a graph."),
     _seconds,
 )
 def resource_check(file: Path, offline: bool, seconds: float, options: Options) -> int:
@@ -136,7 +130,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
     from rmpa.resource.describing import DESCRIPTIONS, LiveGraph, look
 
     master = options.master()
-    graph = await read_graph(master)
+    graph = await master.graph()
     names = {node.name for node in resource.nodes.values()} & set(graph.nodes)
     servers = {node.server or node.name for node in resource.nodes.values()}
     sources = [source for _, each in resource.expressions() for source in each.sources.values()]
@@ -151,7 +145,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
             seconds=seconds,
         )
 
-    seen = await with_node(master, "rmpa_resource", body)
+    seen = await master.with_node("rmpa_resource", body)
     return GraphCheck(resource, text, file, graph.publishers, graph.types, graph.nodes, seen).misfits()
 
 
@@ -160,11 +154,11 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
     from rmpa.resource.describing import DESCRIPTIONS, DIAGNOSTICS, UPDATES, Found, LiveGraph, look, started_by
 
     master = options.master()
-    graph = await read_graph(master)
+    graph = await master.graph()
     name = next((each for each in graph.nodes if _is(wanted, each)), None)
     if name is None:
         raise unknown_name("node", str(wanted), graph.nodes)
-    facts = await _facts(graph, master.uri, name)
+    facts = await master.node_facts(graph, name)
     ends = [t.removesuffix(DESCRIPTIONS) for t in facts.publications if t.endswith(DESCRIPTIONS)]
     server = name if name in ends else min(ends, key=len, default="")
     measured = [t for t in facts.publications if not t.endswith((DESCRIPTIONS, UPDATES, "/rosout"))]
@@ -179,7 +173,7 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
             seconds=seconds,
         )
 
-    seen = await with_node(master, "rmpa_resource", body)
+    seen = await master.with_node("rmpa_resource", body)
     started = started_by(facts.pid) if facts.pid else {}
     return Found(str(wanted), facts, seen, server, started, seconds)
 
@@ -189,16 +183,3 @@ def _is(wanted: GraphName, node: str) -> bool:
     if wanted.peer is None:
         return node == wanted.name
     return proxy is not None and wanted.matches(node) and proxy[1] == wanted.name
-
-
-async def _facts(graph: Graph, master_uri: str, name: str) -> NodeFacts:
-    """The registrations of a node, and the process id of one that answers on this machine."""
-    reply = await call_api(master_uri, "lookupNode", _CALLER_ID, name)
-    uri = str(reply.value) if reply.code == 1 else ""
-    facts = describe_node(name, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
-    if proxied_node(name) is not None:
-        return facts
-    try:
-        return msgspec.structs.replace(facts, pid=(await ping_node(name, uri, _CALLER_ID)).pid)
-    except RmpaError as error:
-        return msgspec.structs.replace(facts, problem=str(error))

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import peers
-from rmpa.cli.graph import find_peer, origin_text, read_graph, run_stream, with_node
-from rmpa.cli.options import Options, argument, flag, graph_verb, summary
+from rmpa.cli.graph import find_peer, origin_text, run_stream
+from rmpa.cli.options import Options, argument, flag, graph_verb, option, peers, summary
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
@@ -37,15 +36,15 @@ _TICK: Final = 0.1
 
 @graph_verb(
     argument("modules", peers, nargs=-1, metavar="MODULE..."),
-    click.option(
+    option(
         "--level",
+        help="Only this level and worse ones.",
         type=click.Choice([level.lower() for level in LEVELS], case_sensitive=False),
         default="ok",
-        help="Only this level and worse ones.",
     ),
-    click.option("--name", default="*", metavar="PATTERN", help="Only names like this: '*battery*'."),
-    flag("-v", "--values", help="With the values."),
-    flag("-f", "--follow", help="Go on: print each change of a level, until Ctrl-C."),
+    option("--name", "PATTERN", "Only names like this: '*battery*'.", default="*"),
+    flag("-v --values", "With the values."),
+    flag("-f --follow", "Go on: print each change of a level, until Ctrl-C."),
 )
 def diagnostics(modules: tuple[str, ...], level: str, name: str, values: bool, follow: bool, options: Options) -> int:
     """Show what the nodes of all modules, or of each MODULE, say on /diagnostics: the worst first.
@@ -113,7 +112,7 @@ class _Watch:
 
     async def listen(self) -> None:
         """Hear each publisher once, if it speaks in time."""
-        graph = await read_graph(self._master)
+        graph = await self._master.graph()
         publishers = {node for node in graph.publishers.get(TOPIC, ()) if self._is_of(proxied_peer(node) or "")}
         if not publishers:
             where = ", ".join(each or self._own for each in sorted(self._modules)) or "any module"
@@ -132,7 +131,7 @@ class _Watch:
             for refusal in subscriber.refusals.values():
                 warn(refusal, "refused")
 
-        await with_node(self._master, "rmpa_diagnostics", hear)
+        await self._master.with_node("rmpa_diagnostics", hear)
         for each in sorted(publishers - self._heard):
             warn(f"{origin_text(each)} has sent nothing for {limits.DIAGNOSTIC_STALE:g} s", "nothing-sent")
         self._tell_problems(set())
@@ -155,7 +154,7 @@ class _Watch:
                 show(self.table.judge(time.time()))
                 self._tell_problems(told)
 
-        await with_node(self._master, "rmpa_diagnostics", go_on)
+        await self._master.with_node("rmpa_diagnostics", go_on)
 
     async def _subscribe(self, node: Node, changed: Callable[[list[Status]], None]) -> Any:
         kind = MessageType(ARRAY_TYPE)

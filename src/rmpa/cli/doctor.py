@@ -9,9 +9,7 @@ import sys
 from collections import Counter
 from typing import TYPE_CHECKING
 
-import click
-
-from rmpa.cli.options import FiniteRange, Options, config_option, flag, json_verb
+from rmpa.cli.options import FiniteRange, Options, config_option, flag, json_verb, option
 from rmpa.cli.output import Painted, confirm, paint_level, print_text, printable, warn
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
@@ -29,10 +27,10 @@ if TYPE_CHECKING:
 
 @json_verb(
     config_option,
-    flag("-q", "--quiet", help="Show only failures and warnings."),
-    click.option("--listen", metavar="SECONDS", type=FiniteRange(1.0), help="Wait for multicasts of other machines."),
-    flag("--fix", help="Repair what is safe: show the commands, ask, run them, check again."),
-    flag("--yes", help="With --fix: do not ask."),
+    flag("-q --quiet", "Show only failures and warnings."),
+    option("--listen", "SECONDS", "Wait for multicasts of other machines.", type=FiniteRange(1.0)),
+    flag("--fix", "Repair what is safe: show the commands, ask, run them, check again."),
+    flag("--yes", "With --fix: do not ask."),
 )
 def doctor(config: str | None, quiet: bool, listen: float | None, fix: bool, yes: bool, options: Options) -> int:
     """Check this machine: settings, agents, network, ROS environment, clock and rights.

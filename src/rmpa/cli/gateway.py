@@ -14,7 +14,7 @@ import click
 
 from rmpa.cli.main import LazyGroup, verb
 from rmpa.cli.module import check_gateway, find_module
-from rmpa.cli.options import config_option, setting_options
+from rmpa.cli.options import config_option, option, setting_options
 from rmpa.cli.output import begin_log, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX
 from rmpa.config.read import load_settings
@@ -164,11 +164,7 @@ def _check_agents(settings: Settings) -> None:
 
 @verb(
     setting_options("gateway", without=_OF_THE_PROCESS),
-    click.option(
-        "--name",
-        metavar="NAME",
-        help="The gateway whose certificate it has. [default: the module's name, then _gateway]",
-    ),
+    option("--name", "NAME", "The gateway whose certificate it has. [default: the module's name, then _gateway]"),
     config_option,
 )
 def gateway_zenoh_config(**options: object) -> None:

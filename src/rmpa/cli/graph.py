@@ -15,7 +15,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name, is_meant, proxied_node, proxied_peer
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.limits import CONTROL_CALL_TIMEOUT
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 
 if TYPE_CHECKING:
@@ -24,91 +24,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.core.facts import RouteInfo
-    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo, Snapshot
+    from rmpa.ros.environment import NodeFacts
     from rmpa.ros.node.node import Node, Received
 
 # Seconds between two lines of figures, as rostopic has it.
 TICK: Final = 1.0
 _T = TypeVar("_T")
 _Table: TypeAlias = list[tuple[str, list[str]]]
+# The node that verbs are, as masters and nodes log it.
+CALLER_ID: Final = "/rmpa_node"
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
-
-
-@dataclass(frozen=True, slots=True)
-class Master:
-    """The master to ask.
-
-    Args:
-        uri: Its address.
-        source: Why it was chosen (``--master``, ``ROS_MASTER_URI`` …), for the text of errors.
-        agent: The control socket of the agent whose core it is; ``None`` for any other master.
-    """
-
-    uri: str
-    source: str
-    agent: Path | None = None
-
-    def unreachable(self) -> UnreachableError:
-        """The error for a master that does not answer."""
-        return UnreachableError("ROS master", f"{self.uri} ({self.source})", _REMEDY)
-
-    def no_agent(self) -> UnreachableError:
-        """The error for a question about peers at a master that is not an agent's core."""
-        remedy = "name the agent with --agent, or run `rmpa up`: only an agent knows peers"
-        return UnreachableError("agent", f"{self.uri} ({self.source})", remedy)
-
-    def snapshot(
-        self,
-        *,
-        topics: tuple[str, ...] | None = None,
-        services: tuple[str, ...] | bool | None = None,
-        peers: bool = True,
-    ) -> Snapshot | None:
-        """The snapshot of the master's agent; ``None`` without an agent, or if it does not answer.
-
-        Args:
-            topics: Only these topics are in it; ``None``: all, which takes the agent longer.
-            services: Only these are in it; ``True``: all; ``None``: all if all topics are in it, else none.
-            peers: Whether peers are in it.
-        """
-        if self.agent is not None:
-            with contextlib.suppress(RmpaError), ControlClient(self.agent) as client:
-                return client.call("snapshot", Snapshot, topics=topics, services=services, peers=peers)
-        return None
-
-
-def choose_master(master: str | None, agent: str | None, environ: Mapping[str, str]) -> Master:
-    """Choose the master: ``--master``; ``ROS_MASTER_URI``, unless an agent is named; the core of the agent that runs.
-
-    Raises:
-        UnreachableError: The named agent does not answer.
-        RmpaError: Several agents run, and none is named.
-        ConfigError: ``--master`` is no URI.
-    """
-    if master is not None:
-        if not re.fullmatch(r"http://[^\s/:]+:[0-9]{1,5}/?", master):
-            raise ConfigError("--master", f"{master!r} is not a master's URI", f"one looks like {DEFAULT_MASTER_URI}")
-        return _with_agent(master, "--master", environ)
-    uri = environ.get("ROS_MASTER_URI", "")
-    if not agent and not environ.get("RMPA_AGENT"):
-        if uri:
-            return _with_agent(uri, "ROS_MASTER_URI", environ)
-        if not find_agents(environ):
-            return Master(DEFAULT_MASTER_URI, "no agent runs")
-    found = choose_agent(environ, agent)
-    with ControlClient(found.path) as client:
-        return Master(client.agent().core_uri, f"the core of agent {found.name}", found.path)
-
-
-def _with_agent(uri: str, source: str, environ: Mapping[str, str]) -> Master:
-    """A master given by its URI; with its agent if the URI is that of an agent's core."""
-    for found in find_agents(environ):
-        with contextlib.suppress(RmpaError), ControlClient(found.path) as client:
-            if same_core(client.agent().core_uri, uri):
-                return Master(uri, source, found.path)
-    others = ", ".join(found.name for found in find_agents(environ))
-    # The classic mistake: a shell that still points to yesterday's robot.
-    return Master(uri, f"{source}; not the core of {others}: unset it, or say --agent" if others else source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,29 +105,6 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
     raise RmpaError(problem, code="unknown-name")
 
 
-def require_peer(master: Master, graph: Graph, wanted: GraphName) -> None:
-    """Check that the peer of a name is known here: a node of it stands in the graph, or the agent knows the peer.
-
-    Raises:
-        UnreachableError: The master is not an agent's core, and so knows no peers.
-        RmpaError: There is no such peer; the text offers the nearest name.
-    """
-    if wanted.peer is None or any(wanted.matches(node) for node in graph.nodes):
-        return
-    snapshot = master.snapshot(topics=())
-    if snapshot is None:
-        raise master.no_agent()
-    known = {peer.name for peer in snapshot.peers}
-    if wanted.peer == snapshot.agent.name and wanted.peer not in known:
-        problem = f"{wanted.peer} is this module itself: leave it out and write {wanted.name}"
-        raise RmpaError(problem, code="invalid-value")
-    # Of a module of another site, SITE/MODULE, the agent knows the site.
-    peer = find_peer(snapshot, wanted.peer.partition("/")[0])
-    if peer.name not in wanted.peer:
-        problem = f"{wanted.peer} is the GUID of {peer.name}: write {peer.name}:{wanted.name}"
-        raise RmpaError(problem, code="invalid-value")
-
-
 def origin_json(node: str) -> dict[str, str]:
     """A node for JSON: a proxy with the peer and the node that it stands for."""
     proxy = proxied_node(node)
@@ -244,21 +147,6 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> RmpaError:
     )
 
 
-def warn_unpublished(master: Master, graph: Graph, wanted: GraphName) -> None:
-    """Say on stderr that no node publishes a topic yet, if that is so: a command waits for its messages.
-
-    Args:
-        master: The master of the graph.
-        graph: The graph.
-        wanted: The topic; with a peer only that peer's publishers count.
-    """
-    if any(map(wanted.matches, graph.publishers.get(wanted.name, ()))):
-        return
-    why = f"`rmpa why {wanted}` says why" if master.agent is not None else ""
-    hint = why if wanted.name in graph.publishers else suggestion(wanted.name, graph.publishers, why)
-    warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""), "no-publisher")
-
-
 @dataclass(frozen=True, slots=True)
 class Graph:
     """The graph of a master.
@@ -290,15 +178,6 @@ class Graph:
         """The node that serves a service; empty: none is known."""
         return next(iter(self.services.get(service, ())), "")
 
-    def require_topic(self, topic: str) -> None:
-        """Check that a topic is there.
-
-        Raises:
-            RmpaError: It is not; the text offers the nearest one.
-        """
-        if topic not in self.publishers and topic not in self.subscribers:
-            raise unknown_name("topic", topic, self.topics)
-
     def require_service(self, wanted: GraphName) -> str:
         """Check that a service is there; return the node that serves it.
 
@@ -315,33 +194,250 @@ class Graph:
         return self.server(wanted.name)
 
 
-async def read_graph(master: Master) -> Graph:
-    """Ask a master for its graph.
+class Enough(Exception):  # noqa: N818 - not an error
+    """``--count`` is reached: raised by the callback of ``Master.watch``, which then returns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Master:
+    """The master to ask.
+
+    Args:
+        uri: Its address.
+        source: Why it was chosen (``--master``, ``ROS_MASTER_URI`` …), for the text of errors.
+        agent: The control socket of the agent whose core it is; ``None`` for any other master.
+    """
+
+    uri: str
+    source: str
+    agent: Path | None = None
+
+    def unreachable(self) -> UnreachableError:
+        """The error for a master that does not answer."""
+        return UnreachableError("ROS master", f"{self.uri} ({self.source})", _REMEDY)
+
+    def no_agent(self) -> UnreachableError:
+        """The error for a question about peers at a master that is not an agent's core."""
+        remedy = "name the agent with --agent, or run `rmpa up`: only an agent knows peers"
+        return UnreachableError("agent", f"{self.uri} ({self.source})", remedy)
+
+    def snapshot(
+        self,
+        *,
+        topics: tuple[str, ...] | None = None,
+        services: tuple[str, ...] | bool | None = None,
+        peers: bool = True,
+    ) -> Snapshot | None:
+        """The snapshot of the master's agent; ``None`` without an agent, or if it does not answer.
+
+        Args:
+            topics: Only these topics are in it; ``None``: all, which takes the agent longer.
+            services: Only these are in it; ``True``: all; ``None``: all if all topics are in it, else none.
+            peers: Whether peers are in it.
+        """
+        with contextlib.suppress(RmpaError), self.client() as client:
+            return client.snapshot(topics=topics, services=services, peers=peers)
+        return None
+
+    def client(self, timeout: float = CONTROL_CALL_TIMEOUT) -> ControlClient:
+        """A connection to the master's agent.
+
+        Raises:
+            UnreachableError: This is not an agent's core, or its agent does not answer.
+        """
+        if self.agent is None:
+            raise self.no_agent()
+        return ControlClient(self.agent, timeout)
+
+    async def graph(self) -> Graph:
+        """Its graph.
+
+        Raises:
+            UnreachableError: It does not answer.
+            RmpaError: It answers with something else.
+        """
+        from rmpa.ros.http.rpc import call_api
+
+        try:
+            state = (await call_api(self.uri, "getSystemState", CALLER_ID)).value
+            types = (await call_api(self.uri, "getTopicTypes", CALLER_ID)).value
+        except UnreachableError:
+            raise self.unreachable() from None
+        try:
+            tables = msgspec.convert(state, list[object])[:3]
+            publishers, subscribers, services = msgspec.convert(tables, tuple[_Table, _Table, _Table])
+            known = {name: kind for name, kind in msgspec.convert(types, list[tuple[str, str]]) if kind != "*"}
+        except msgspec.ValidationError:
+            problem = f"{self.uri} answers getSystemState with something else; is it a ROS master?"
+            raise RmpaError(problem, code="protocol-error") from None
+        names = [{name: sorted(nodes) for name, nodes in table} for table in (publishers, subscribers, services)]
+        return Graph(names[0], names[1], known, names[2])
+
+    def require_peer(self, graph: Graph, wanted: GraphName) -> None:
+        """Check that the peer of a name is known here: a node of it stands in the graph, or the agent knows the peer.
+
+        Raises:
+            UnreachableError: This is not an agent's core, and so knows no peers.
+            RmpaError: There is no such peer; the text offers the nearest name.
+        """
+        if wanted.peer is None or any(wanted.matches(node) for node in graph.nodes):
+            return
+        snapshot = self.snapshot(topics=())
+        if snapshot is None:
+            raise self.no_agent()
+        known = {peer.name for peer in snapshot.peers}
+        if wanted.peer == snapshot.agent.name and wanted.peer not in known:
+            problem = f"{wanted.peer} is this module itself: leave it out and write {wanted.name}"
+            raise RmpaError(problem, code="invalid-value")
+        # Of a module of another site, SITE/MODULE, the agent knows the site.
+        peer = find_peer(snapshot, wanted.peer.partition("/")[0])
+        if peer.name not in wanted.peer:
+            problem = f"{wanted.peer} is the GUID of {peer.name}: write {peer.name}:{wanted.name}"
+            raise RmpaError(problem, code="invalid-value")
+
+    def warn_unpublished(self, graph: Graph, wanted: GraphName) -> None:
+        """Say on stderr that no node publishes a topic yet, if that is so: a command waits for its messages.
+
+        Args:
+            graph: The graph.
+            wanted: The topic; with a peer only that peer's publishers count.
+        """
+        if any(map(wanted.matches, graph.publishers.get(wanted.name, ()))):
+            return
+        why = f"`rmpa why {wanted}` says why" if self.agent is not None else ""
+        hint = why if wanted.name in graph.publishers else suggestion(wanted.name, graph.publishers, why)
+        warn(f"{wanted} is not published yet; waiting" + (f" ({hint})" if hint else ""), "no-publisher")
+
+    async def node_uri(self, graph: Graph, name: str) -> str:
+        """The URI of the slave API of a node.
+
+        Raises:
+            RmpaError: There is no such node; the text offers the nearest one.
+        """
+        from rmpa.ros.http.rpc import call_api
+
+        reply = await call_api(self.uri, "lookupNode", CALLER_ID, name)
+        if reply.code == 1 and isinstance(reply.value, str):
+            return reply.value
+        raise unknown_name("node", name, [node for node in graph.nodes if proxied_peer(node) is None])
+
+    async def node_facts(self, graph: Graph, name: str) -> NodeFacts:
+        """The registrations of a node, and its process id, or why it does not answer; a proxy is not asked.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        from rmpa.ros.environment import describe_node
+        from rmpa.ros.node.ask import ping_node
+
+        uri = await self.node_uri(graph, name)
+        facts = describe_node(name, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
+        if proxied_node(name) is not None:
+            return facts
+        try:
+            return msgspec.structs.replace(facts, pid=(await ping_node(name, uri, CALLER_ID)).pid)
+        except RmpaError as error:
+            return msgspec.structs.replace(facts, problem=str(error))
+
+    async def with_node(self, name: str, body: Callable[[Node], Awaitable[_T]]) -> _T:
+        """What ``body`` returns, run with a node of a unique name.
+
+        Raises:
+            UnreachableError: It does not answer.
+        """
+        from rmpa.ros.node.node import Node
+
+        node = Node(name, master_uri=self.uri, anonymous=True)
+        try:
+            await node.__aenter__()
+        except UnreachableError:
+            raise self.unreachable() from None
+        try:
+            return await body(node)
+        finally:
+            await node.close()
+
+    async def watch(
+        self, wanted: GraphName, take: Callable[[Received], None], tick: Callable[[], Awaitable[None]] | None = None
+    ) -> None:
+        """Subscribe to a topic until the callback raises, or the master ends this node.
+
+        Args:
+            wanted: The topic; with a peer only messages of that peer's nodes count.
+            take: Called for each message; what it raises is raised here, but ``Enough``.
+            tick: Called when there is the subscription, each second, and at the end.
+        """
+        import asyncio
+
+        from rmpa.runtime.tasks import start_task
+
+        ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+        def on_message(received: Received) -> None:
+            if ended.done() or not wanted.matches(received.caller_id):
+                return
+            try:
+                take(received)
+            except Enough:
+                ended.set_result(None)
+            except BaseException as error:  # noqa: BLE001 - carried over to the command, which fails with it
+                ended.set_exception(error)
+
+        async def listen(node: Node) -> None:
+            subscriber = await node.subscribe(wanted.name, None, on_message)
+            stopped = start_task(node.stopped.wait(), "wait for the node's end")
+            try:
+                ends: set[asyncio.Future[Any]] = {ended, stopped}
+                done: set[asyncio.Future[Any]] = set()
+                while not done:
+                    if tick is not None:
+                        await tick()
+                    timeout = TICK if tick is not None else None
+                    done, _ = await asyncio.wait(ends, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+                if ended.done():
+                    ended.result()
+            finally:
+                stopped.cancel()
+                for refusal in subscriber.refusals.values():
+                    warn(refusal, "refused")
+            if tick is not None:
+                await tick()
+
+        await self.with_node("rmpa_topic", listen)
+
+
+def choose_master(master: str | None, agent: str | None, environ: Mapping[str, str]) -> Master:
+    """Choose the master: ``--master``; ``ROS_MASTER_URI``, unless an agent is named; the core of the agent that runs.
 
     Raises:
-        UnreachableError: It does not answer.
-        RmpaError: It answers with something else.
+        UnreachableError: The named agent does not answer.
+        RmpaError: Several agents run, and none is named.
+        ConfigError: ``--master`` is no URI.
     """
-    from rmpa.ros.http.rpc import call_api
-
-    try:
-        state = (await call_api(master.uri, "getSystemState", "/rmpa_topic")).value
-        types = (await call_api(master.uri, "getTopicTypes", "/rmpa_topic")).value
-    except UnreachableError:
-        raise master.unreachable() from None
-    try:
-        tables = msgspec.convert(state, list[object])[:3]
-        publishers, subscribers, services = msgspec.convert(tables, tuple[_Table, _Table, _Table])
-        known = {name: kind for name, kind in msgspec.convert(types, list[tuple[str, str]]) if kind != "*"}
-    except msgspec.ValidationError:
-        problem = f"{master.uri} answers getSystemState with something else; is it a ROS master?"
-        raise RmpaError(problem, code="protocol-error") from None
-    names = [{name: sorted(nodes) for name, nodes in table} for table in (publishers, subscribers, services)]
-    return Graph(names[0], names[1], known, names[2])
+    if master is not None:
+        if not re.fullmatch(r"http://[^\s/:]+:[0-9]{1,5}/?", master):
+            raise ConfigError("--master", f"{master!r} is not a master's URI", f"one looks like {DEFAULT_MASTER_URI}")
+        return _with_agent(master, "--master", environ)
+    uri = environ.get("ROS_MASTER_URI", "")
+    if not agent and not environ.get("RMPA_AGENT"):
+        if uri:
+            return _with_agent(uri, "ROS_MASTER_URI", environ)
+        if not find_agents(environ):
+            return Master(DEFAULT_MASTER_URI, "no agent runs")
+    found = choose_agent(environ, agent)
+    with ControlClient(found.path) as client:
+        return Master(client.agent().core_uri, f"the core of agent {found.name}", found.path)
 
 
-class Enough(Exception):  # noqa: N818 - not an error
-    """``--count`` is reached: raised by the callback of ``watch_topic``, which then returns."""
+def _with_agent(uri: str, source: str, environ: Mapping[str, str]) -> Master:
+    """A master given by its URI; with its agent if the URI is that of an agent's core."""
+    for found in find_agents(environ):
+        with contextlib.suppress(RmpaError), ControlClient(found.path) as client:
+            if same_core(client.agent().core_uri, uri):
+                return Master(uri, source, found.path)
+    others = ", ".join(found.name for found in find_agents(environ))
+    # The classic mistake: a shell that still points to yesterday's robot.
+    return Master(uri, f"{source}; not the core of {others}: unset it, or say --agent" if others else source)
 
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
@@ -359,78 +455,6 @@ def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
     with contextlib.suppress(KeyboardInterrupt, asyncio.CancelledError):
         raise_file_limit()
         asyncio.run(run())
-
-
-async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[_T]]) -> _T:
-    """What ``body`` returns, run with a node of a unique name at a master.
-
-    Raises:
-        UnreachableError: The master does not answer.
-    """
-    from rmpa.ros.node.node import Node
-
-    node = Node(name, master_uri=master.uri, anonymous=True)
-    try:
-        await node.__aenter__()
-    except UnreachableError:
-        raise master.unreachable() from None
-    try:
-        return await body(node)
-    finally:
-        await node.close()
-
-
-async def watch_topic(
-    master: Master,
-    wanted: GraphName,
-    take: Callable[[Received], None],
-    tick: Callable[[], Awaitable[None]] | None = None,
-) -> None:
-    """Subscribe to a topic until the callback raises, or the master ends this node.
-
-    Args:
-        master: The master to ask.
-        wanted: The topic; with a peer only messages of that peer's nodes count.
-        take: Called for each message; what it raises is raised here, but ``Enough``.
-        tick: Called when there is the subscription, each second, and at the end.
-    """
-    import asyncio
-
-    from rmpa.runtime.tasks import start_task
-
-    ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    def on_message(received: Received) -> None:
-        if ended.done() or not wanted.matches(received.caller_id):
-            return
-        try:
-            take(received)
-        except Enough:
-            ended.set_result(None)
-        except BaseException as error:  # noqa: BLE001 - carried over to the command, which fails with it
-            ended.set_exception(error)
-
-    async def listen(node: Node) -> None:
-        subscriber = await node.subscribe(wanted.name, None, on_message)
-        stopped = start_task(node.stopped.wait(), "wait for the node's end")
-        try:
-            ends: set[asyncio.Future[Any]] = {ended, stopped}
-            done: set[asyncio.Future[Any]] = set()
-            while not done:
-                if tick is not None:
-                    await tick()
-                seconds = TICK if tick is not None else None
-                done, _ = await asyncio.wait(ends, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-            if ended.done():
-                ended.result()
-        finally:
-            stopped.cancel()
-            for refusal in subscriber.refusals.values():
-                warn(refusal, "refused")
-        if tick is not None:
-            await tick()
-
-    await with_node(master, "rmpa_topic", listen)
 
 
 def shown_state(route: RouteInfo) -> str:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import click
 
 from rmpa.cli.options import Options, flag, json_verb
-from rmpa.cli.output import Table, print_text, printable, warn
-from rmpa.cli.redact import without_passwords
+from rmpa.cli.output import Table, print_text, printable, warn, without_passwords
 from rmpa.cli.units import CONFIG, config_text
 from rmpa.config.module_name import kept_name, of_unit, state_dir
 from rmpa.config.read import FILE_NAME, find_config_file, parse_config, ros_layer
@@ -52,9 +51,9 @@ class Finding(NamedTuple):
 
 @json_verb(
     click.argument("file", required=False, metavar="[FILE]"),
-    flag("--system", help=f"Write {CONFIG}, which the units of rmpa service read."),
-    flag("--force", help="Replace the file that is there."),
-    flag("--dry-run", help="Write nothing; print the file. FILE - means the same."),
+    flag("--system", f"Write {CONFIG}, which the units of rmpa service read."),
+    flag("--force", "Replace the file that is there."),
+    flag("--dry-run", "Write nothing; print the file. FILE - means the same."),
 )
 def init(file: str | None, system: bool, force: bool, dry_run: bool, options: Options) -> None:
     """Write a first rmpa.toml, from what is found on this machine; the default of FILE is ./rmpa.toml.

@@ -5,23 +5,22 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import click
 import msgspec
 
 from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.limits import LAUNCH_LOG_LINES
-from rmpa.cli.completion import ANSWER, peers
 from rmpa.cli.graph import suggestion
-from rmpa.cli.options import FiniteRange, Options, agent_verb, argument, flag
+from rmpa.cli.options import ANSWER, FiniteRange, Options, agent_verb, argument, flag, option, options_of, peers
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe.limits import CONTROL_HANDLER_TIMEOUT
 from rmpa.ros.environment import NodeCost
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Sequence
 
     from rmpa.bridge.launched import LaunchedResource
     from rmpa.observe.control_client import ControlClient
@@ -41,11 +40,7 @@ _CLEAR: Final = "\x1b[H\x1b[2J"
 
 def _launchable(ctx: click.Context, _: str) -> Iterable[str]:
     """What can be started, for a shell's completion."""
-    import os
-
-    from rmpa.observe.control_client import ControlClient, choose_agent
-
-    with ControlClient(choose_agent(os.environ, ctx.params.get("agent")).path, ANSWER) as client:
+    with options_of(ctx).client(ANSWER) as client:
         own = client.agent().name
         for module in client.call("launch", tuple[ModuleResources, ...], what="list"):
             for each in module.resources:
@@ -153,14 +148,13 @@ def resource_restart(resource: str, options: Options) -> int:
 
 @agent_verb(
     argument("resource", _launchable, metavar="[MODULE:]RESOURCE"),
-    flag("-f", "--follow", help="Go on to print lines as they come, until Ctrl-C."),
-    click.option(
-        "-n",
-        "--lines",
-        type=click.IntRange(1, LAUNCH_LOG_LINES),
+    flag("-f --follow", "Go on to print lines as they come, until Ctrl-C."),
+    option(
+        "-n --lines",
         help=f"At most so many of each log, the newest. [default: {_LINES}, with -f {_BEFORE}]",
+        type=click.IntRange(1, LAUNCH_LOG_LINES),
     ),
-    click.option("--node", default="", metavar="NODE", help="Only of this node of the resource: its declared name."),
+    option("--node", "NODE", "Only of this node of the resource: its declared name.", default=""),
 )
 def resource_log(resource: str, follow: bool, lines: int | None, node: str, options: Options) -> None:
     """Show what a resource and the nodes that it has started have written, kept on their own machine.
@@ -185,26 +179,21 @@ def resource_log(resource: str, follow: bool, lines: int | None, node: str, opti
                 raise RmpaError(f"{resource} has no log of a node {node}; {hint}", code="unknown-name")
             for log in found.logs:
                 after[log.source] = log.next
-                if not node or log.source == node:
-                    _print_log(log.source, log.lines, options)
+                for line in log.lines if not node or log.source == node else ():
+                    if options.as_json:
+                        print_json({"node": log.source or None, "text": line})
+                    else:
+                        print_text(f"{log.source}: {line}" if log.source else line)
             if not follow:
                 return
             sys.stdout.flush()
             time.sleep(_LOOK)
 
 
-def _print_log(source: str, lines: Iterable[str], options: Options) -> None:
-    for line in lines:
-        if options.as_json:
-            print_json({"node": source or None, "text": line})
-        else:
-            print_text(f"{source}: {line}" if source else line)
-
-
 @agent_verb(
     argument("modules", peers, nargs=-1, metavar="[MODULE]..."),
-    flag("--once", help="Show it once; in a pipe and as JSON that is always so."),
-    click.option("-i", "--interval", type=FiniteRange(0.5), default=2.0, show_default=True, help="Seconds between."),
+    flag("--once", "Show it once; in a pipe and as JSON that is always so."),
+    option("-i --interval", help="Seconds between.", type=FiniteRange(0.5), default=2.0, show_default=True),
 )
 def top(modules: tuple[str, ...], once: bool, interval: float, options: Options) -> int:
     """Show the processes and topics of all modules at a glance, or of each MODULE: CPU, memory, threads, rates.
@@ -226,58 +215,65 @@ def top(modules: tuple[str, ...], once: bool, interval: float, options: Options)
             client.call("rates", dict[str, Any])
             time.sleep(_MEASURED)
         while True:
-            told = client.call("top", dict[str, Any], modules=list(modules))
+            told = client.call("top", dict[str, str | tuple[NodeCost, ...]], modules=list(modules))
             rates = client.call("rates", dict[str, Any])
-            seen = {name: value if isinstance(value, str) else _costs(value) for name, value in told.items()}
+            seen = [ModuleLoad.of(name, nodes, rates.get(name)) for name, nodes in told.items()]
             if options.as_json:
-                print_json({"modules": [*_as_json(seen, rates)]})
+                print_json({"modules": seen})
             else:
                 if live:
                     click.echo(_CLEAR, nl=False)
-                _print_top(seen, rates)
-            for name in (missing := [name for name in modules if isinstance(seen.get(name, ""), str)]):
-                warn(f"{name}: {seen.get(name) or 'no linked module has this name'}", "peer-unlinked")
+                _print_top(seen)
+            well = {one.module for one in seen if one.problem is None}
+            for name in (missing := [name for name in modules if name not in well]):
+                problem = next((one.problem for one in seen if one.module == name), None)
+                warn(f"{name}: {problem or 'no linked module has this name'}", "peer-unlinked")
             if not live:
                 return int(bool(missing))
             time.sleep(interval)
     return 0
 
 
-def _costs(value: object) -> tuple[NodeCost, ...]:
-    return msgspec.convert(value, tuple[NodeCost, ...])
+class ModuleLoad(msgspec.Struct, frozen=True):
+    """What the nodes of a module cost, and its topics with the most bytes a second.
+
+    Attributes:
+        module: Its name.
+        problem: Why it does not tell; ``None``: it does.
+        nodes: Its nodes.
+        topics: The topics: ``topic``, ``rate`` and ``bandwidth``.
+    """
+
+    module: str
+    problem: str | None
+    nodes: tuple[NodeCost, ...]
+    topics: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, module: str, nodes: str | tuple[NodeCost, ...], rates: object) -> Self:
+        """From what the operations ``top`` and ``rates`` tell of a module: a text where it does not."""
+        rows = [row for row in rates if row[2]] if isinstance(rates, list) else []
+        rows.sort(key=lambda row: -row[2])
+        topics = [dict(zip(("topic", "rate", "bandwidth"), row, strict=False)) for row in rows[:_TOPICS]]
+        return cls(module, nodes, (), topics) if isinstance(nodes, str) else cls(module, None, nodes, topics)
 
 
-def _busiest(rates: object) -> list[dict[str, Any]]:
-    """The topics of a module with the most bytes a second."""
-    rows = [row for row in rates if row[2]] if isinstance(rates, list) else []
-    rows.sort(key=lambda row: -row[2])
-    return [{"topic": row[0], "rate": row[1], "bandwidth": row[2]} for row in rows[:_TOPICS]]
-
-
-def _as_json(seen: Mapping[str, str | tuple[NodeCost, ...]], rates: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for name, nodes in seen.items():
-        problem = nodes if isinstance(nodes, str) else None
-        listed = [] if isinstance(nodes, str) else msgspec.to_builtins(nodes)
-        yield {"module": name, "problem": problem, "nodes": listed, "topics": _busiest(rates.get(name))}
-
-
-def _print_top(seen: Mapping[str, str | tuple[NodeCost, ...]], rates: Mapping[str, Any]) -> None:
-    rows = []
-    for name, nodes in seen.items():
-        if isinstance(nodes, str):
-            warn(f"{name}: {nodes}", "peer-unlinked")
-            continue
-        for one in sorted(nodes, key=lambda each: (-each.cpu, each.node)):
-            if one.pid is None:
-                cells = ["-"] * 5
-            else:
+def _print_top(seen: Sequence[ModuleLoad]) -> None:
+    rows, topics = [], []
+    for module in seen:
+        if module.problem is not None:
+            warn(f"{module.module}: {module.problem}", "peer-unlinked")
+        for one in sorted(module.nodes, key=lambda each: (-each.cpu, each.node)):
+            cells = ["-"] * 5
+            if one.pid is not None:
                 cells = [str(one.pid), _percent(one.cpu), size(one.rss), str(one.threads), _age(one.since)]
-            rows.append([f"{name}:{one.node}", *cells, one.started_by])
+            rows.append([f"{module.module}:{one.node}", *cells, one.started_by])
+        for row in module.topics:
+            name, bandwidth = f"{module.module}:{row['topic']}", f"{size(row['bandwidth'])}/s"
+            topics.append([name, f"{row['rate']:.1f} Hz", bandwidth])
     print_text(Table("NODE, >PROCESS, >CPU, >MEMORY, >THREADS, >RUNS, RESOURCE", rows))
-    busy = [(name, row) for name in seen for row in _busiest(rates.get(name))]
-    shown = [[f"{name}:{row['topic']}", f"{row['rate']:.1f} Hz", f"{size(row['bandwidth'])}/s"] for name, row in busy]
-    if shown:
-        print_text("", Table("TOPIC, >RATE, >BANDWIDTH", shown))
+    if topics:
+        print_text("", Table("TOPIC, >RATE, >BANDWIDTH", topics))
 
 
 def _age(since: float) -> str:

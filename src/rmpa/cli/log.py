@@ -15,8 +15,7 @@ import click
 
 from rmpa.bridge.limits import LOG_LINES_ASKED
 from rmpa.bridge.log_ring import LEVELS, ModuleLog
-from rmpa.cli.completion import completes, nodes, peers
-from rmpa.cli.options import LINES, Options, agent_verb, argument, flag
+from rmpa.cli.options import LINES, Options, agent_verb, argument, flag, nodes, option, peers
 from rmpa.cli.output import Painted, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import ConfigError
 
@@ -92,23 +91,16 @@ class _Log:
 
 @agent_verb(
     argument("modules", peers, nargs=-1, metavar="[MODULE]..."),
-    flag("-f", "--follow", help="Go on to print lines as they come, until Ctrl-C."),
-    click.option(
-        "--level", type=click.Choice([*LEVELS.values()]), default="info", show_default=True, help="At least."
+    flag("-f --follow", "Go on to print lines as they come, until Ctrl-C."),
+    option("--level", help="At least.", type=click.Choice([*LEVELS.values()]), default="info", show_default=True),
+    option(
+        "--node", "GLOB", "Only of nodes like this: '/arm/*', arm:/hand; /rmpa is the agent.", default="", find=nodes
     ),
-    click.option(
-        "--node",
-        default="",
-        metavar="GLOB",
-        shell_complete=completes(nodes),
-        help="Only of nodes like this: '/arm/*', arm:/hand; /rmpa is the agent.",
-    ),
-    click.option("--since", default="", metavar="TIME", help="Only of the last so long: 30s, 5m, 2h."),
-    click.option(
-        "-n",
-        "--lines",
-        type=click.IntRange(1, LOG_LINES_ASKED),
+    option("--since", "TIME", "Only of the last so long: 30s, 5m, 2h.", default=""),
+    option(
+        "-n --lines",
         help=f"At most so many of them, the newest. [default: {LINES}, with -f {_BEFORE}]",
+        type=click.IntRange(1, LOG_LINES_ASKED),
     ),
 )
 def log(

@@ -66,12 +66,12 @@ _DECLARED: Final = {
     "node log-level": ("node", "Show the levels of a node's loggers, and set one."),
     "top": ("launch", "Show the processes and topics of all modules: CPU, memory, rates."),
     "record": ("record", "Record what happens on this module; keep, fetch and merge recordings of all."),
-    "record list": ("record", "List what the modules have kept, and what their recorders do."),
-    "record info": ("record", "Show what is known of a recording."),
-    "record keep": ("record", "Keep what all modules have of the last minutes."),
-    "record fetch": ("record", "Fetch a recording from all modules that have it."),
-    "record merge": ("record", "Put recordings of several modules on one timeline."),
-    "record rm": ("record", "Remove a recording."),
+    "record list": ("recordings", "List what the modules have kept, and what their recorders do."),
+    "record info": ("recordings", "Show what is known of a recording."),
+    "record keep": ("recordings", "Keep what all modules have of the last minutes."),
+    "record fetch": ("recordings", "Fetch a recording from all modules that have it."),
+    "record merge": ("recordings", "Put recordings of several modules on one timeline."),
+    "record rm": ("recordings", "Remove a recording."),
     "play": ("play", "Play a recording into this module's core."),
     "diff": ("play", "Compare two recordings, topic by topic."),
     "story": ("play", "Say what happened in a recording."),
@@ -119,8 +119,8 @@ _DECLARED: Final = {
     "trust renew": ("trust", "Renew the certificate now, or the group key of all."),
     "trust revoke": ("trust", "Exclude a module from the mesh, at the authority."),
     "trust leave": ("trust", "Remove this module's keys and certificate."),
-    "trust invite": ("trust_join", "Invite a module, at the authority: print a token, and wait."),
-    "trust join": ("trust_join", "Join a secured mesh with a token, or by files."),
+    "trust invite": ("trust", "Invite a module, at the authority: print a token, and wait."),
+    "trust join": ("trust", "Join a secured mesh with a token, or by files."),
     "trust check": ("trust", "Say whether a peer may do something here, and by which rule."),
     "why": ("agent", "Say why a topic of a peer does not arrive, and what to do."),
     "explain": ("agent", "Say what the code of an error or a warning means, and what to do."),
@@ -133,7 +133,7 @@ _DECLARED: Final = {
     "config show": ("agent", "Print each setting that `rmpa up` would use here, and where it comes from."),
     "config schema": ("agent", "Print the JSON Schema of rmpa.toml: editors check and complete the file with it."),
     "reload": ("agent", "Let the agent read its settings again."),
-    "completion": ("completion", "Print the script that completes rmpa's commands in a shell."),
+    "completion": ("program", "Print the script that completes rmpa's commands in a shell."),
 }
 _FAMILIES: Final = {file.removesuffix(".py") for file in os.listdir(os.path.dirname(__file__))}  # noqa: PTH208, PTH120
 _OWN: Final = {words for words, (module, _) in _DECLARED.items() if module in _FAMILIES and module != "main"}
@@ -142,14 +142,6 @@ VERBS: Final = {
     words: about
     for words, about in _DECLARED.items()
     if words in _OWN or any(each.startswith(f"{words} ") for each in _OWN)
-}
-# What to use in place of a command that is gone, by its words behind ``rmpa``.
-REMOVED_VERBS: Final = {
-    "experiment": "in a clone: make experiment, or python -m lab experiment (docs/compare/experiments.md)",
-    "multicast": "`rmpa doctor --listen 30` on one machine and `rmpa doctor` on the other try multicast between them",
-    "resource history": "record it: rosbag record /SONAR/decision /SONAR/quality /SONAR/alarms",
-    "site last": "record the topic with rosbag where it is needed, or keep its key by a storage of Zenoh",
-    "trust import": "write [[permission]] tables into rmpa.toml: docs/guides/trust.md#permissions",
 }
 # Words that are no commands of ``rmpa``, and what a user who writes them wants.
 MEANT: Final = {
@@ -320,19 +312,13 @@ class LazyGroup(PlacedHelp, click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command; for a misspelt one the error names the nearest."""
-        if args and args[0] not in self.commands_at and args[0] not in self._plugins():
-            words = " ".join((*ctx.command_path.split()[1:], args[0]))
-            if remedy := REMOVED_VERBS.get(words):
-                raise ConfigError(f"rmpa {words}", "is not a command any more", remedy, code="removed")
-            if not args[0].startswith("-"):
-                near = did_you_mean(args[0], self.commands_at)
-                meant = (
-                    () if self._path else [each for each in MEANT.get(args[0], ()) if each in VERBS or each[0] == "-"]
-                )
-                others = meant or ([near] if near else [])
-                named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
-                hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
-                ctx.fail(f"No such command {args[0]!r}. {hint}")
+        word = args[0] if args else "-"
+        if word not in self.commands_at and not word.startswith("-") and word not in self._plugins():
+            near, meant = did_you_mean(word, self.commands_at), () if self._path else MEANT.get(word, ())
+            others = [each for each in meant if each in VERBS or each[0] == "-"] or ([near] if near else [])
+            named = " or ".join(f"`{ctx.command_path} {other}`" for other in others)
+            hint = f"Did you mean {named}?" if others else f"There are {', '.join(self.commands_at)}."
+            ctx.fail(f"No such command {word!r}. {hint}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
@@ -490,14 +476,13 @@ def _show_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if as_json and not wanted:
         raise click.NoSuchOption("--json", ctx=ctx)
     if wanted:
-        from rmpa.cli import version
-
+        program = importlib.import_module("rmpa.cli.program")
         if as_json:
             from rmpa.cli.output import print_json
 
-            print_json(version.about())
+            print_json(program.about())
         else:
-            click.echo(f"rmpa {version.long_version()}")
+            click.echo(f"rmpa {program.long_version()}")
         ctx.exit()
 
 

@@ -13,20 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import topics
-from rmpa.cli.graph import (
-    Enough,
-    read_graph,
-    read_name,
-    require_peer,
-    run_stream,
-    warn_unpublished,
-    watch_topic,
-    with_node,
-)
-from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb
-from rmpa.cli.output import print_json, print_text, warn
-from rmpa.cli.values import fill_stamps, flatten, pick, read_values, shorten, to_text
+from rmpa.cli.graph import Enough, read_name, run_stream
+from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, option, topics
+from rmpa.cli.output import fill_stamps, flatten, pick, print_json, print_text, read_values, shorten, to_text, warn
 from rmpa.core.errors import ConfigError, UnreachableError
 from rmpa.core.identity import proxied_node
 
@@ -57,10 +46,10 @@ def split_field(text: str, graph: Graph) -> tuple[GraphName, list[str]]:
 @graph_verb(
     argument("topic", topics),
     count_option("messages"),
-    flag("-p", "--plot", help="Comma-separated values, for plotting."),
-    flag("--noarr", help="Leave arrays out."),
-    flag("--nostr", help="Leave strings out."),
-    flag("-c", "--clear", help="Clear the terminal before each message."),
+    flag("-p --plot", "Comma-separated values, for plotting."),
+    flag("--noarr", "Leave arrays out."),
+    flag("--nostr", "Leave strings out."),
+    flag("-c --clear", "Clear the terminal before each message."),
 )
 def topic_echo(
     topic: str, count: int | None, plot: bool, noarr: bool, nostr: bool, clear: bool, options: Options
@@ -101,11 +90,11 @@ def topic_echo(
             raise Enough
 
     async def run() -> None:
-        graph = await read_graph(master)
+        graph = await master.graph()
         wanted, path = split_field(topic, graph)
-        require_peer(master, graph, wanted)
-        warn_unpublished(master, graph, wanted)
-        await watch_topic(master, wanted, lambda received: show(received, wanted, path))
+        master.require_peer(graph, wanted)
+        master.warn_unpublished(graph, wanted)
+        await master.watch(wanted, lambda received: show(received, wanted, path))
 
     run_stream(run)
 
@@ -120,9 +109,9 @@ def _csv(cells: list[str]) -> str:
     argument("topic", topics),
     argument("kind", metavar="TYPE"),
     argument("values", nargs=-1),
-    click.option("-r", "--rate", type=FiniteRange(0.001, 10_000), help="Messages a second, until Ctrl-C."),
-    flag("-1", "--once", help="Publish one message and end."),
-    flag("-l", "--latch", help="Latch, with -r too: a new subscriber gets the last message."),
+    option("-r --rate", help="Messages a second, until Ctrl-C.", type=FiniteRange(0.001, 10_000)),
+    flag("-1 --once", "Publish one message and end."),
+    flag("-l --latch", "Latch, with -r too: a new subscriber gets the last message."),
     context_settings={"ignore_unknown_options": True},
 )
 def topic_pub(
@@ -186,7 +175,7 @@ def topic_pub(
             await _wait(node, max(0.0, begin + number / rate - time.monotonic()))
 
     try:
-        run_stream(lambda: with_node(master, "rmpa_pub", publish))
+        run_stream(lambda: master.with_node("rmpa_pub", publish))
     except UnreachableError as error:
         if unknown is None:
             raise

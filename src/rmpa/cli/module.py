@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import socket
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import click
+
+from rmpa.cli.options import Options, config_option, json_verb, option
+from rmpa.cli.output import warn
+from rmpa.cli.units import STATE
 from rmpa.config import module_name
 from rmpa.config.read import Loaded, load_settings
 from rmpa.config.settings import Settings
-from rmpa.core.errors import ConfigError, StartError, UnreachableError, missing_extra
+from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError, missing_extra
 from rmpa.core.identity import peer_name_problem
 from rmpa.observe.control_client import ControlClient, find_agents, running_agents
 from rmpa.runtime.plugins import NEIGHBOURS, find_plugins
@@ -22,12 +28,14 @@ from rmpa.trust.permissions import TrustStatus
 from rmpa.trust.store import TrustStore
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.config.module_name import ModuleName
     from rmpa.trust.membership import Membership, MeshAuthority
 
 _T = TypeVar("_T")
+# The codes of files that this user cannot use.
+_CLOSED: Final = ("keys-unusable", "directory-unusable")
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,3 +271,51 @@ def _is_there(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except ValueError:  # it was taken out of sys.modules
         return False
+
+
+def module_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
+    """A ``json_verb`` with ``--name`` and ``--config``, whose function gets the module that they mean."""
+    name_option = option(
+        "--name",
+        "NAME",
+        "This module. [default: RMPA_AGENT, RMPA_NAME, rmpa.toml, the agent that runs; else as rmpa up has it]",
+    )
+
+    def decorate(function: Callable[..., None]) -> click.Command:
+        @functools.wraps(function)
+        def command(name: str | None, config: str | None, options: Options, **given: Any) -> None:
+            module = find_module(name, {"config": config}, os.environ)
+            try:
+                function(module, options, **given)
+            except StartError as error:
+                if not (os.geteuid() and module.state == Path(STATE) and error.code in _CLOSED):
+                    raise
+                words = click.get_current_context().command_path
+                problem, remedy = f"the keys of {module.name} are the service's", f"sudo {words} …"
+                raise StartError(words, problem, remedy, code="root-needed") from None
+
+        return json_verb(*parameters, name_option, config_option)(command)
+
+    return decorate
+
+
+def keep_member_name(module: Module) -> str:
+    """Keep the name of a module that has keys now as that of this machine; return the command that starts it.
+
+    The name of another module that has keys itself stays. A gateway's is none of a module.
+    """
+    if unnoted := module_name.note_state_dir(module.place):
+        missed = f"a start without RMPA_STATE_DIR={module.place} will miss these keys: {unnoted}"
+        warn(f"{missed}; write require = true into [trust] of rmpa.toml", "directory-unusable")
+    if module.name.endswith(module_name.GATEWAY_SUFFIX):
+        return f"rmpa gateway --name {module.name}"
+    usual = ""
+    try:
+        kept = module_name.kept_name(module.place)
+        if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
+            module_name.keep_name(module.place, module.name, instead=True)
+        config = {"config": module.loaded.settings.config_file}
+        usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
+    except RmpaError as error:
+        warn(f"the name {module.name} is not kept: {error}", "directory-unusable")
+    return "rmpa up" if usual == module.name else f"rmpa up --name {module.name}"

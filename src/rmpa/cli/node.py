@@ -7,18 +7,25 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from msgspec.structs import replace
-
-from rmpa.cli.completion import nodes
-from rmpa.cli.graph import Graph, GraphName, read_graph, read_name, require_peer, unknown_name
-from rmpa.cli.options import Options, Selection, argument, flag, graph_verb, ping_options, selection_options, summary
+from rmpa.cli.graph import CALLER_ID, Graph, GraphName, read_name
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    argument,
+    by_module,
+    flag,
+    graph_verb,
+    nodes,
+    ping_options,
+    pings,
+    selection_options,
+)
 from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import is_own, proxied_node, proxied_peer
-from rmpa.observe import limits as observe_limits
-from rmpa.observe.control_client import ControlClient
+from rmpa.observe.limits import CONTROL_HANDLER_TIMEOUT
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
+from rmpa.ros.environment import NodeFacts, NodeLine, NodePing, PeerNodes, list_nodes
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import lookup_calls, read_lookups
 from rmpa.ros.node.ask import end_node, ping_node
@@ -33,7 +40,6 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 # A node and its peer; ``None``: this module's own.
 _Line = tuple[str | None, NodeLine]
-_CALLER_ID: Final = "/rmpa_node"
 _ROSOUT: Final = "/rosout"
 # Modules that one line names.
 _NAMED: Final = 3
@@ -50,53 +56,21 @@ def _read_node(text: str) -> GraphName:
     return wanted if proxy is None else GraphName(proxy[1], proxy[0])
 
 
-async def _find_uri(master: Master, graph: Graph, name: str) -> str:
-    """The URI of the slave API of a node of a master's graph.
-
-    Raises:
-        RmpaError: There is no such node; the text offers the nearest one.
-    """
-    reply = await call_api(master.uri, "lookupNode", _CALLER_ID, name)
-    if reply.code == 1 and isinstance(reply.value, str):
-        return reply.value
-    raise unknown_name("node", name, [node for node in graph.nodes if proxied_peer(node) is None])
-
-
 def _module_of(master: Master) -> str | None:
     """The name of the master's agent, if it has one."""
     snapshot = master.snapshot(topics=(), peers=False)
     return snapshot.agent.name if snapshot is not None else None
 
 
-def _ask(master: Master, kind: type[_T], what: str, peer: str | None, **args: str) -> _T:
-    """Ask the agents of other modules about their nodes, through the agent of this module.
-
-    Args:
-        master: This module's.
-        kind: The type of the answer.
-        what: ``node.list``, ``node.info``, ``node.ping`` or ``node.kill``.
-        peer: The peer; ``None``: all.
-        args: The node.
+def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T:
+    """Ask the agent of a node's module about the node, through the agent of this module.
 
     Raises:
         UnreachableError: This master is not an agent's core.
-        PeerRefused: There is no such peer, it does not answer, or it refuses.
+        RmpaError: There is no such peer, it does not answer, or it refuses; in its own words.
     """
-    if master.agent is None:
-        raise master.no_agent()
-    with ControlClient(master.agent, timeout=observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
-        return client.call("node", kind, what=what, peer=peer, **args)
-
-
-def _ask_peer(master: Master, wanted: GraphName, what: str, kind: type[_T]) -> _T:
-    """Ask the agent of a node's module about the node; errors are in its own words."""
-    try:
-        return _ask(master, kind, what, wanted.peer, node=wanted.name)
-    except PeerRefused as error:
-        # The peer's agent refuses, not this one; its name is in the text.
-        raise RmpaError(
-            f"{error.reason}; {error.remedy}" if error.remedy else error.reason, code=error.code
-        ) from None
+    with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+        return client.pass_on("node", kind, what=what, peer=wanted.peer, node=wanted.name)
 
 
 def _untold(told: Iterable[PeerNodes]) -> Iterator[str]:
@@ -126,7 +100,8 @@ def _of_peers(master: Master, graph: Graph, peer: str | None) -> list[_Line]:
         return shown
     told: tuple[PeerNodes, ...] = ()
     try:
-        told = _ask(master, tuple[PeerNodes, ...], "node.list", peer)
+        with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+            told = client.call("node", tuple[PeerNodes, ...], what="node.list", peer=peer)
     except PeerRefused:
         if peer is None or not shown:
             raise
@@ -148,14 +123,12 @@ def _named(master: Master, names: tuple[str, ...], *, everything: bool) -> list[
         raise ConfigError("NODE", "name some nodes, or say --all", "one of both")
     if names:
         return [_read_node(name) for name in names]
-    graph = asyncio.run(read_graph(master))
+    graph = asyncio.run(master.graph())
     return [_read_node(node) for node in graph.nodes if not is_own(node) and node != _ROSOUT]
 
 
 @graph_verb(
-    argument("node", nodes, default=""),
-    ping_options,
-    flag("-a", "--all", "everything", help="Each node of this module, once."),
+    argument("node", nodes, default=""), ping_options, flag("-a --all everything", "Each node of this module, once.")
 )
 def node_ping(node: str, count: int | None, interval: float, everything: bool, options: Options) -> int:
     """Ask whether a node answers, and how fast: a call of its slave API.
@@ -175,14 +148,11 @@ def node_ping(node: str, count: int | None, interval: float, everything: bool, o
     if everything:
         answers = [_ping(master, one, 1, options) for one in found]
         return 0 if all(answers) else 1
-    require_peer(master, Graph(), found[0])
-    answered = sent = 0
+    master.require_peer(Graph(), found[0])
+    answered = False
     with contextlib.suppress(KeyboardInterrupt):
-        while count is None or sent < count:
-            if sent:
-                time.sleep(interval)
-            sent += 1
-            answered += _ping(master, found[0], sent, options)
+        for number in pings(count, interval):
+            answered |= _ping(master, found[0], number, options)
     return 0 if answered else 1
 
 
@@ -190,8 +160,8 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
     """Ping a node once and print the result; return whether it answered."""
 
     async def here() -> NodePing:
-        uri = await _find_uri(master, await read_graph(master), wanted.name)
-        return await ping_node(wanted.name, uri, _CALLER_ID)
+        uri = await master.node_uri(await master.graph(), wanted.name)
+        return await ping_node(wanted.name, uri, CALLER_ID)
 
     about: dict[str, object] = {"node": str(wanted), "seq": number, "time": None}
     begin = time.monotonic()
@@ -210,7 +180,7 @@ def _ping(master: Master, wanted: GraphName, number: int, options: Options) -> b
 
 @graph_verb(
     argument("nodes", nodes, nargs=-1, metavar="NODE..."),
-    flag("-a", "--all", "everything", help="All of this module but /rosout and the agent's own."),
+    flag("-a --all everything", "All of this module but /rosout and the agent's own."),
 )
 def node_kill(nodes: tuple[str, ...], everything: bool, options: Options) -> int:
     """Ask nodes to end, and wait until they have ended.
@@ -243,8 +213,8 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
     """End a node; return why it lives on, with the code, or empty texts."""
 
     async def here() -> bool:
-        uri = await _find_uri(master, await read_graph(master), wanted.name)
-        return await end_node(wanted.name, uri, _CALLER_ID, "user request")
+        uri = await master.node_uri(await master.graph(), wanted.name)
+        return await end_node(wanted.name, uri, CALLER_ID, "user request")
 
     try:
         if wanted.peer is not None:
@@ -261,7 +231,7 @@ def _kill(master: Master, wanted: GraphName) -> tuple[str, str]:
 
 @graph_verb(
     argument("namespace", nodes, default=""),
-    flag("-v", "--verbose", help="With module, address, and counts of topics and services."),
+    flag("-v --verbose", "With module, address, and counts of topics and services."),
     selection_options,
 )
 def node_list(namespace: str, verbose: bool, selection: Selection, options: Options) -> None:
@@ -288,22 +258,19 @@ def node_list(namespace: str, verbose: bool, selection: Selection, options: Opti
         for peer, line in found
         if wanted.contains(line.name, (peer,)) and selection.wants(line.name, (peer,))
     ]
-    long = not options.as_json and selection.is_long(every)
-    found = every[: selection.lines] if long else every  # this module's own are the first
+    shown = selection.first(every, lambda one: one[0] is not None)  # this module's own are the first
     here = _module_of(master) if options.as_json or verbose else None
 
     def text() -> Iterator[Text]:
-        if long:
-            yield summary(len(every), "nodes", ("remote" if peer else "of this module" for peer, _ in every))
-            yield ""
+        about = by_module("nodes", [peer is not None for peer, _ in every])
+        lines: Text = (paint(str(GraphName(line.name, peer)), "cyan" if peer else None) for peer, line in shown)
         if verbose:
-            yield Table("NODE, MODULE, >PUB, >SUB, >SRV, URI", [_row(peer, line, here) for peer, line in found])
-        else:
-            yield from (paint(str(GraphName(line.name, peer)), "cyan" if peer else None) for peer, line in found)
-        yield selection.rest(every, "nodes", "rmpa node list MODULE:/, /NAMESPACE, --match '*driver*'")
+            lines = Table("NODE, MODULE, >PUB, >SUB, >SRV, URI", [_row(peer, line, here) for peer, line in shown])
+        filters = "rmpa node list MODULE:/, /NAMESPACE, --match '*driver*'"
+        yield selection.framed(every, "nodes", about, filters, lines)
 
-    options.show([_json(peer, line, here) for peer, line in found], text())
-    for peer, line in found:
+    options.show([_json(peer, line, here) for peer, line in shown], text())
+    for peer, line in shown:
         if line.problem:
             warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}", "node-unreachable")
 
@@ -316,7 +283,7 @@ def _own(master: Master, graph: Graph, *, with_uris: bool) -> list[NodeLine]:
     asked = names if with_uris else [name for name in names if name in problems]
     uris: dict[str, str] = {}
     if asked:
-        answer = asyncio.run(call(master.uri, "system.multicall", lookup_calls(_CALLER_ID, asked, ())))
+        answer = asyncio.run(call(master.uri, "system.multicall", lookup_calls(CALLER_ID, asked, ())))
         uris = read_lookups(answer, asked, ())[0]
     lines = list_nodes(graph.publishers, graph.subscribers, graph.services, uris, problems)
     return [line for line in lines if proxied_peer(line.name) is None]
@@ -347,13 +314,7 @@ def node_info(node: str, options: Options) -> None:
     wanted = _read_node(node)
 
     async def here() -> NodeFacts:
-        graph = await read_graph(master)
-        uri = await _find_uri(master, graph, wanted.name)
-        facts = describe_node(wanted.name, uri, graph.publishers, graph.subscribers, graph.services, graph.types)
-        try:
-            return replace(facts, pid=(await ping_node(wanted.name, uri, _CALLER_ID)).pid)
-        except RmpaError as error:
-            return replace(facts, problem=str(error))
+        return await master.node_facts(await master.graph(), wanted.name)
 
     facts = _ask_peer(master, wanted, "node.info", NodeFacts) if wanted.peer is not None else asyncio.run(here())
     module = wanted.peer or _module_of(master)
@@ -371,10 +332,10 @@ def node_info(node: str, options: Options) -> None:
         if facts.problem:
             warn(facts.problem, "node-unreachable")
 
-    about: dict[str, object] = {"name": facts.name, "peer": wanted.peer, "module": module}
-    about |= {"uri": facts.uri, "pid": facts.pid, "reachable": not facts.problem, "problem": facts.problem or None}
-    about |= {"publications": facts.publications, "subscriptions": facts.subscriptions}
-    options.show(about | {"services": facts.services}, text())
+    about = {"name": facts.name, "peer": wanted.peer, "module": module, "uri": facts.uri, "pid": facts.pid}
+    reached = {"reachable": not facts.problem, "problem": facts.problem or None}
+    ends = {"publications": facts.publications, "subscriptions": facts.subscriptions, "services": facts.services}
+    options.show({**about, **reached, **ends}, text())
 
 
 @graph_verb(argument("node", nodes), argument("logger", default=""), argument("level", default=""))
@@ -401,7 +362,9 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
     if level and level not in LEVELS:
         raise ConfigError("LEVEL", f"{level!r} is not a level", f"use one of {', '.join(LEVELS)}")
     if wanted.peer is not None:
-        levels = _levels_of_peer(master, wanted, logger, level)
+        with master.client(CONTROL_HANDLER_TIMEOUT) as client:
+            args = {"peer": wanted.peer, "node": wanted.name, "logger": logger, "level": level}
+            levels = client.pass_on("log_level", dict[str, str], **args)
     else:
         levels = asyncio.run(_levels(master, wanted.name, logger, level))
     about = {"node": wanted.name, "peer": wanted.peer, "loggers": levels}
@@ -414,21 +377,10 @@ def node_log_level(node: str, logger: str, level: str, options: Options) -> None
 
 
 async def _levels(master: Master, node: str, logger: str, level: str) -> dict[str, str]:
-    reply = await call_api(master.uri, "lookupService", _CALLER_ID, f"{node}/get_loggers")
-    api = await _find_uri(master, await read_graph(master), node)
+    reply = await call_api(master.uri, "lookupService", CALLER_ID, f"{node}/get_loggers")
+    api = await master.node_uri(await master.graph(), node)
     if reply.code != 1 or not isinstance(reply.value, str):
         raise RmpaError(f"{node} has no loggers: it does not provide {node}/get_loggers", code="unknown-name")
     if level:
-        return await set_level(reply.value, node, _CALLER_ID, logger, level)
-    return await read_levels(reply.value, api, node, _CALLER_ID)
-
-
-def _levels_of_peer(master: Master, wanted: GraphName, logger: str, level: str) -> dict[str, str]:
-    if master.agent is None:
-        raise master.no_agent()
-    with ControlClient(master.agent, timeout=observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
-        try:
-            args = {"peer": wanted.peer, "node": wanted.name, "logger": logger, "level": level}
-            return client.call("log_level", dict[str, str], **args)
-        except PeerRefused as error:
-            raise RmpaError(error.reason, code=error.code) from None
+        return await set_level(reply.value, node, CALLER_ID, logger, level)
+    return await read_levels(reply.value, api, node, CALLER_ID)

@@ -1,27 +1,29 @@
-"""How a verb is declared: its docstring, its own arguments, and the options that verbs share."""
+"""How a verb is declared: its own arguments, what a shell completes of them, and the options that verbs share."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 import sys
+import time
 from collections import Counter
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import click
 
-from rmpa.cli.completion import agents, completes
 from rmpa.cli.main import decorated, verb
 from rmpa.config.settings import SETTINGS
+from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
-    from rmpa.cli.completion import Find
-    from rmpa.cli.graph import Graph, Master
+    from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
     from rmpa.config.schema import Setting
     from rmpa.observe.control_client import ControlClient
@@ -30,6 +32,101 @@ _T = TypeVar("_T")
 _Function = TypeVar("_Function", bound="Callable[..., Any]")
 # Lines of a long list that a terminal shows.
 LINES: Final = 100
+# Finds names, for the command line so far and the begun word.
+Find: TypeAlias = "Callable[[click.Context, str], Iterable[str]]"
+# Seconds that the agent or master has for its answer: a person waits with the key pressed.
+ANSWER: Final = 0.3
+
+
+def completes(find: Find, *modules: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """A function for ``shell_complete`` of an argument or option: the names that begin as a user began to write.
+
+    There are none where no agent or master answers in time.
+
+    Args:
+        find: Finds the names.
+        modules: What it imports: the time that this takes is not the agent's.
+    """
+
+    def complete(ctx: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+        import contextlib
+        import importlib
+        import threading
+
+        found: set[str] = set()
+
+        def ask() -> None:
+            with contextlib.suppress(RmpaError, OSError, ValueError):
+                found.update(name for name in find(ctx, incomplete) if name.startswith(incomplete))
+
+        for module in ("asyncio", "rmpa.cli.graph", "rmpa.ros.http.rpc", *modules):
+            importlib.import_module(module)
+        # In a thread, which the end of the program ends: an agent that hangs must not hold up the shell.
+        asked = threading.Thread(target=ask, daemon=True)
+        asked.start()
+        asked.join(ANSWER)
+        return sorted(found)
+
+    return complete
+
+
+def options_of(ctx: click.Context) -> Options:
+    """The shared options of a command line so far."""
+    return Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
+
+
+def graph_of(ctx: click.Context) -> Graph:
+    """The graph of the master that a command line means."""
+    return options_of(ctx).graph()[1]
+
+
+def of_peer(name: str, node: str) -> str:
+    """A name as a user writes it: ``PEER:/name`` if the node that offers it is a peer's proxy."""
+    from rmpa.core.identity import proxied_peer
+
+    peer = proxied_peer(node)
+    return name if peer is None else f"{peer}:{name}"
+
+
+def _with_peers(found: dict[str, list[str]], incomplete: str) -> Iterable[str]:
+    """Names, of this module and of its peers; ``PEER:/name`` too, unless a name without peer has been begun."""
+    for name, nodes in found.items():
+        yield name
+        if not incomplete.startswith("/"):
+            yield from (of_peer(name, node) for node in nodes)
+
+
+def agents(_: click.Context, __: str) -> Iterable[str]:
+    """Agents of this machine."""
+    from rmpa.observe.control_client import find_agents
+
+    return [agent.name for agent in find_agents(os.environ)]
+
+
+def peers(ctx: click.Context, _: str) -> Iterable[str]:
+    """Modules that the agent knows."""
+    with options_of(ctx).client(ANSWER) as client:
+        return [peer.name for peer in client.snapshot(topics=()).peers]
+
+
+def topics(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Topics of the graph."""
+    graph = graph_of(ctx)
+    return _with_peers(graph.subscribers | graph.publishers, incomplete)
+
+
+def services(ctx: click.Context, incomplete: str) -> Iterable[str]:
+    """Services of the graph."""
+    return _with_peers(graph_of(ctx).services, incomplete)
+
+
+def nodes(ctx: click.Context, _: str) -> Iterable[str]:
+    """Nodes of the graph."""
+    from rmpa.core.identity import proxied_node
+
+    for node in graph_of(ctx).nodes:
+        proxy = proxied_node(node)
+        yield node if proxy is None else of_peer(proxy[1], node)
 
 
 def json_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
@@ -48,7 +145,7 @@ def graph_verb(*parameters: Callable[..., Any], **settings: Any) -> Callable[[Ca
 
 
 def argument(name: str, find: Find | None = None, **settings: Any) -> Callable[[_Function], _Function]:
-    """An argument that a shell completes with the names that are found, as ``completion.completes`` does."""
+    """An argument that a shell completes with the names that are found, as ``completes`` does."""
     return click.argument(name, shell_complete=completes(find) if find else None, **settings)
 
 
@@ -67,37 +164,65 @@ class FiniteRange(click.FloatRange):
         return found
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
-agent_option = click.option(
-    "--agent",
-    metavar="NAME",
-    shell_complete=completes(agents),
-    help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]",
-)
-_master_option = click.option(
-    "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
-)
-config_option = click.option(
-    "--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]"
-)
+def option(
+    names: str,
+    metavar: str = "",
+    help: str = "",  # noqa: A002 - click's name
+    *,
+    find: Find | None = None,
+    **settings: Any,
+) -> Callable[[_Function], _Function]:
+    """An option with a value.
+
+    Args:
+        names: As click has them, ``-n --count``, and the name of the function's argument if it is another one.
+        metavar: What stands for the value; empty: the name of its type.
+        help: The line of ``--help``.
+        find: As for ``argument``.
+        settings: For ``click.option``.
+    """
+    complete = completes(find) if find else None
+    return click.option(*names.split(), metavar=metavar or None, help=help, shell_complete=complete, **settings)
 
 
-def flag(*names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
-    """An option that is given or not."""
-    return click.option(*names, is_flag=True, help=help)
+def flag(names: str, help: str) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
+    """An option that is given or not; ``names`` as for ``option``."""
+    return click.option(*names.split(), is_flag=True, help=help)
+
+
+json_option = flag("--json as_json", "Print JSON; a stream prints one object a line.")
+agent_option = option(
+    "--agent", "NAME", "Which agent of this machine to ask, if several run. [env: RMPA_AGENT]", find=agents
+)
+_master_option = option("--master", "URI", "The ROS master to ask. [default: see rmpa topic --help]")
+config_option = option("--config", "FILE", "Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+
+
+def output_option(help: str, metavar: str = "FILE", *, required: bool = False) -> Callable[[_Function], _Function]:  # noqa: A002 - click's name
+    """``--output``: where something is written."""
+    type_ = click.Path(path_type=Path)
+    return option("-o --output", metavar, help, type=type_, required=required)
 
 
 def count_option(what: str) -> Callable[[_Function], _Function]:
     """``--count``: the end of a stream."""
-    return click.option("-n", "--count", type=click.IntRange(1), help=f"Stop after so many {what}.")
+    return option("-n --count", help=f"Stop after so many {what}.", type=click.IntRange(1))
 
 
 def ping_options(function: _Function) -> _Function:
     """Decorate with ``--count`` and ``--interval`` of a ping."""
     seconds = FiniteRange(0.01)
-    every = click.option("-i", "--interval", type=seconds, default=1.0, show_default=True, help="Seconds between.")
-    count = click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
+    every = option("-i --interval", help="Seconds between.", type=seconds, default=1.0, show_default=True)
+    count = option("-c --count", help="Stop after so many. [default: at Ctrl-C]", type=click.IntRange(1))
     return count(every(function))
+
+
+def pings(count: int | None, interval: float) -> Iterator[int]:
+    """The numbers of pings, so many seconds apart; ``count``: as many as that, else without an end."""
+    for number in itertools.count(1) if count is None else range(1, count + 1):
+        if number > 1:
+            time.sleep(interval)
+        yield number
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,18 +268,22 @@ class Options:
 
         return choose_master(self.master_uri, self.agent, os.environ)
 
-    def graph(self) -> tuple[Master, Graph]:
+    def graph(self, wanted: GraphName | None = None) -> tuple[Master, Graph]:
         """The master that is meant, and its graph.
 
+        Args:
+            wanted: A name whose peer, if it has one, has to be known.
+
         Raises:
-            RmpaError: As ``choose_master`` and ``read_graph``.
+            RmpaError: As ``choose_master``, ``Master.graph`` and ``Master.require_peer``.
         """
         import asyncio
 
-        from rmpa.cli.graph import read_graph
-
         master = self.master()
-        return master, asyncio.run(read_graph(master))
+        graph = asyncio.run(master.graph())
+        if wanted is not None:
+            master.require_peer(graph, wanted)
+        return master, graph
 
 
 def _as_options(*declared: Callable[..., Any]) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
@@ -214,7 +343,7 @@ class Selection:
         match: Pattern of a shell for the name; empty: every name.
         peer: Pattern for the name of a module; empty: every module, and this one.
         limit: Lines to show at most; ``None``: as many as fit the way of output.
-        everything: Whether nothing is left out.
+        everything: Whether nothing is left out, as in JSON.
     """
 
     match: str = ""
@@ -239,16 +368,28 @@ class Selection:
         """Whether some of the items are left out."""
         return self.lines is not None and len(items) > self.lines
 
-    def rest(self, items: Collection[object], what: str, filters: str) -> list[str]:
-        """A line that says what was left out, and how to see it; none if all are shown.
+    def first(self, items: Sequence[_T], order: Callable[[_T], Any]) -> Sequence[_T]:
+        """Those that are shown: all as they are; of a long list the first ones in an order."""
+        return sorted(items, key=order)[: self.lines] if self.is_long(items) else items
+
+    def framed(self, items: Collection[object], what: str, about: Text, filters: str, shown: Text) -> Text:
+        """The text of a list; a long one has words in front, and behind it how to see what was left out.
 
         Args:
             items: All of them.
             what: What they are, in the plural.
+            about: The words in front of a long one.
             filters: Options that select fewer, for the user to try.
+            shown: The text of those that are shown.
         """
         left = len(items) - (self.lines or 0)
-        return [f"... {left:,} more {what}; fewer: {filters}; all: --all"] if self.is_long(items) else []
+        rest = f"... {left:,} more {what}; fewer: {filters}; all: --all"
+        return (about, "", shown, rest) if self.is_long(items) else shown
+
+
+def by_module(what: str, remote: Collection[bool]) -> str:
+    """A ``summary`` of what is of other modules, and of this one."""
+    return summary(len(remote), what, ("remote" if each else "of this module" for each in remote))
 
 
 def summary(total: int, what: str, counts: Iterable[str]) -> str:
@@ -258,8 +399,8 @@ def summary(total: int, what: str, counts: Iterable[str]) -> str:
 
 
 limit_options: Final = (
-    click.option("--limit", type=click.IntRange(1), help=f"At most so many. [default: {LINES} on a terminal]"),
-    flag("--all", "everything", help="Leave nothing out on a terminal."),
+    option("--limit", help=f"At most so many. [default: {LINES} on a terminal]", type=click.IntRange(1)),
+    flag("--all everything", "Leave nothing out on a terminal."),
 )
 
 
@@ -267,11 +408,12 @@ def selection_options(function: Callable[..., _T]) -> Callable[..., _T]:
     """Decorate a list with ``--match``, ``--peer``, ``--limit`` and ``--all``; it gets them as ``selection``."""
 
     @functools.wraps(function)
-    def command(*, match: str, peer: str, limit: int | None, everything: bool, **arguments: object) -> _T:
-        return function(**arguments, selection=Selection(match, peer, limit, everything))
+    def command(
+        *, match: str, peer: str, limit: int | None, everything: bool, as_json: bool, **arguments: object
+    ) -> _T:
+        selection = Selection(match, peer, limit, everything or as_json)
+        return function(**arguments, as_json=as_json, selection=selection)
 
-    match_option = click.option(
-        "--match", default="", metavar="PATTERN", help="Only names like this: '*/scan', 'arm?'."
-    )
-    peer_option = click.option("--peer", default="", metavar="PATTERN", help="Only of modules with names like this.")
+    match_option = option("--match", "PATTERN", "Only names like this: '*/scan', 'arm?'.", default="")
+    peer_option = option("--peer", "PATTERN", "Only of modules with names like this.", default="")
     return decorated(command, (match_option, peer_option, *limit_options))

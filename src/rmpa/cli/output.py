@@ -1,4 +1,4 @@
-"""What verbs print: one value as JSON, or as lines and tables; numbers with units.
+"""What verbs print: one value as JSON, or as lines and tables; numbers with units; messages as rostopic has them.
 
 Colours are click's: it drops them where standard output is no terminal, and everywhere with ``NO_COLOR``.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -16,7 +17,7 @@ from unicodedata import combining, east_asian_width
 import click
 import msgspec
 
-from rmpa.core.errors import ConfigError, with_places
+from rmpa.core.errors import ConfigError, RmpaError, with_places
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -24,11 +25,23 @@ if TYPE_CHECKING:
     from typing import TextIO
 
     from rmpa.config.settings import Settings
+    from rmpa.ros.types.messages import Plain
     from rmpa.runtime.log_writer import LogWriter
 
 _INDENT: Final = "    "
 # Of the levels of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.
 _COLOURS: Final = {"ok": "green", "fail": "red", "skipped": "cyan"}
+
+# A field of a message, with its indices: ``covariance[0]``.
+_PART: Final = re.compile(r"(?P<name>\w+)(?P<indices>(?:\[[0-9]+\])*)", re.ASCII)
+_TIME: Final = {"secs", "nsecs"}
+# In place of what no other person is to see.
+GONE: Final = "[redacted]"
+# All up to the last @ of a word, as passwords may have any character; units of systemd have one too.
+USER_INFO: Final = re.compile(
+    r"(?<!\S)((?:[\w.-]+=)?[\"'(<\[]{0,4}(?:[a-zA-Z][\w+.-]*://|(?:tcp|udp|tls|quic|wss?)/)?)"
+    r"\S+@(?![\w.-]*\.(?:service|socket|target)\b)"
+)
 
 
 class Painted(str):
@@ -217,3 +230,130 @@ def size(count: float | None) -> str:
         power += 1
     digits = 2 if abs(count) < 9.995 else 1 if abs(count) < 99.95 else 0
     return f"{count:.{digits}f} {'kMGT'[power - 1]}B"
+
+
+def without_passwords(text: str) -> str:
+    """A text whose addresses have no user names and passwords."""
+    return USER_INFO.sub(rf"\1{GONE}@", text)
+
+
+def pick(plain: Plain, path: list[str]) -> Plain:
+    """Return one field of a message.
+
+    Args:
+        plain: The message.
+        path: Names from the outside in, each perhaps with indices: ``["pose", "covariance[0]"]``.
+
+    Raises:
+        RmpaError: There is no such field or element.
+    """
+    for part in path:
+        match = _PART.fullmatch(part)
+        if match is None:
+            raise RmpaError(f"{part!r} is not a field; one looks like name or name[0]", code="invalid-value")
+        if not isinstance(plain, dict) or match["name"] not in plain:
+            known = ", ".join(plain) if isinstance(plain, dict) else "none"
+            raise RmpaError(f"no field {match['name']!r} in the message; it has {known}", code="invalid-value")
+        plain = plain[match["name"]]
+        for index in re.findall(r"[0-9]+", match["indices"]):
+            if not isinstance(plain, list) or int(index) >= len(plain):
+                raise RmpaError(f"no element {index} in {match['name']!r}", code="invalid-value")
+            plain = plain[int(index)]
+    return plain
+
+
+def shorten(plain: Plain, *, arrays: bool, strings: bool) -> Plain:
+    """A copy of a message in which a note of the length replaces each array, and each string, if wanted."""
+    if isinstance(plain, dict):
+        return {name: shorten(value, arrays=arrays, strings=strings) for name, value in plain.items()}
+    if isinstance(plain, list):
+        if arrays:
+            return _Note(f"<array length: {len(plain)}>")
+        return [shorten(value, arrays=arrays, strings=strings) for value in plain]
+    return _Note(f"<string length: {len(plain)}>") if isinstance(plain, str) and strings else plain
+
+
+class _Note(str):
+    """A text in place of a value, printed without quotes."""
+
+    __slots__ = ()
+
+
+def to_text(plain: Plain, indent: str = "") -> str:
+    """A message in the format of ``rostopic echo``, with control characters escaped."""
+    if isinstance(plain, dict):
+        return "\n".join(_field(name, value, indent) for name, value in plain.items())
+    return indent + _scalar(plain)
+
+
+def _field(name: str, value: Plain, indent: str) -> str:
+    if isinstance(value, dict):
+        return f"{indent}{name}:" + ("\n" + to_text(value, indent + "  ") if value else " {}")
+    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        return f"{indent}{name}:\n" + "\n".join(f"{indent}  -\n{to_text(item, indent + '    ')}" for item in value)
+    return f"{indent}{name}: {_scalar(value)}"
+
+
+def _scalar(value: Plain) -> str:
+    if isinstance(value, list):
+        if any(isinstance(item, dict) for item in value):
+            return "\n".join(f"-\n{to_text(item, '  ')}" for item in value)
+        return f"[{', '.join(map(_scalar, value))}]"
+    if isinstance(value, str) and not isinstance(value, _Note):
+        lines = value.replace("\\", "\\\\").replace('"', '\\"').split("\n")
+        return '"' + "\\n".join(map(printable, lines)) + '"'
+    return str(value)
+
+
+def flatten(plain: Plain, name: str = "field") -> Iterator[tuple[str, str]]:
+    """Columns and cells in the format of ``rostopic echo -p``: times in nanoseconds, elements of arrays numbered."""
+    if isinstance(plain, dict) and plain.keys() == _TIME:
+        yield name, str(plain["secs"] * 1_000_000_000 + plain["nsecs"])  # type: ignore[operator] # both are numbers
+    elif isinstance(plain, dict):
+        for field, value in plain.items():
+            yield from flatten(value, f"{name}.{field}")
+    elif isinstance(plain, list):
+        for index, value in enumerate(plain):
+            yield from flatten(value, f"{name}{index}")
+    else:
+        yield name, printable(str(int(plain) if isinstance(plain, bool) else plain))
+
+
+def read_values(texts: tuple[str, ...]) -> Plain:
+    """Read a message's values from the command line: none, one YAML value, or one for each field in order.
+
+    Raises:
+        ConfigError: It is not YAML.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    values: list[Plain] = []
+    for text in texts:
+        try:
+            values.append(YAML(typ="safe", pure=True).load(text))
+        except (YAMLError, ValueError) as error:
+            problem = getattr(error, "problem", None) or str(error)
+            raise ConfigError("VALUES", f"not YAML: {problem}", f"in {text!r}") from None
+    if len(values) == 1 and values[0] is not None:
+        return values[0]
+    return values or None
+
+
+def fill_stamps(values: Plain, now_ns: int) -> Plain:
+    """Replace ``auto`` (a header) and ``now`` (a stamp) by the time, as rostopic does."""
+    secs, nsecs = divmod(now_ns, 1_000_000_000)
+    stamp: dict[str, Plain] = {"secs": secs, "nsecs": nsecs}
+    if isinstance(values, list):
+        return [fill_stamps(value, now_ns) for value in values]
+    if not isinstance(values, dict):
+        return {"stamp": stamp} if values == "auto" else values
+    filled: dict[str, Plain] = {}
+    for name, value in values.items():
+        if name == "header" and value == "auto":
+            filled[name] = {"stamp": stamp}
+        elif name == "stamp" and value == "now":
+            filled[name] = stamp
+        else:
+            filled[name] = fill_stamps(value, now_ns) if isinstance(value, dict | list) else value
+    return filled

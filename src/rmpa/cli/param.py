@@ -18,9 +18,8 @@ import click
 import yaml
 
 from rmpa.bridge.params.owner import key_problem
-from rmpa.cli.completion import completes, peers
-from rmpa.cli.graph import suggestion
-from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb
+from rmpa.cli.graph import CALLER_ID, suggestion
+from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb, option, options_of, peers
 from rmpa.cli.output import Painted, Table, json_text, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     from rmpa.cli.output import Text
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
-_CALLER: Final = "/rmpa_param"
 # Seconds for one call of a master: it may bring megabytes of XML, from a busy machine.
 _FOR_ALL: Final = 30.0
 _INT_MAX: Final = (1 << 31) - 1
@@ -52,19 +50,15 @@ _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
 
 
 def param_names(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Parameters, and namespaces of them, for ``completion.completes``."""
+    """Parameters, and namespaces of them, for ``options.completes``."""
     before = incomplete.partition(":")[0] + ":" if ":" in incomplete else ""
     peer, _ = split_peer(ctx.params.get("peer"), incomplete)
-    options = Options(as_json=False, agent=ctx.params.get("agent"), master_uri=ctx.params.get("master"))
-    for name in open_store(peer, options).names():
+    for name in open_store(peer, options_of(ctx)).names():
         yield from (before + each for each in with_namespaces(name))  # rosparam's verbs take namespaces too
 
 
-peer_option: Final = click.option(
-    "--peer",
-    metavar="PEER",
-    shell_complete=completes(peers),
-    help="The parameters of this peer's module (or its GUID); ros2/NODE: of a node of ROS 2.",
+peer_option: Final = option(
+    "--peer", "PEER", "The parameters of this peer's module (or its GUID); ros2/NODE: of a node of ROS 2.", find=peers
 )
 
 
@@ -73,11 +67,6 @@ class MasterParams:
     """The parameters of a ROS master, an agent's core or any other; as ``PeerParams``."""
 
     master: Master
-
-    @property
-    def title(self) -> str:
-        """The master, for error texts."""
-        return self.master.uri
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or a namespace.
@@ -101,7 +90,7 @@ class MasterParams:
         for name, one in parameters:
             reply = self._call("setParam", name, one)
             if reply.code != 1:
-                raise RmpaError(f"{self.title} does not set {name}: {reply.status}", code="refused")
+                raise RmpaError(f"{self.master.uri} does not set {name}: {reply.status}", code="refused")
         return len(parameters)
 
     def delete(self, key: str) -> None:
@@ -116,7 +105,7 @@ class MasterParams:
         reply = self._call(method, key)
         if reply.code != 1:
             known = {name for full in self.names() for name in with_namespaces(full)}
-            problem = f"{self.title} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}"
+            problem = f"{self.master.uri} has no parameter {key}; {suggestion(key, known, '`rmpa param list`')}"
             raise RmpaError(problem, code="unknown-name")
         return reply
 
@@ -124,7 +113,7 @@ class MasterParams:
         from rmpa.ros.http.rpc import call_api
 
         try:
-            return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
+            return asyncio.run(call_api(self.master.uri, method, CALLER_ID, *params, timeout=_FOR_ALL))
         except UnreachableError:
             raise self.master.unreachable() from None
 
@@ -347,8 +336,7 @@ def param_verb(*parameters: Any, **settings: Any) -> Callable[[Callable[..., Non
 
 
 @param_verb(
-    argument("key", param_names),
-    flag("-p", "--pretty", help="Print a string as it is, without YAML's quotes and folding."),
+    argument("key", param_names), flag("-p --pretty", "Print a string as it is, without YAML's quotes and folding.")
 )
 def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> None:
     """Print the parameter KEY, or all of the namespace KEY, as YAML.
@@ -372,8 +360,8 @@ def param_get(key: str, pretty: bool, peer: str | None, options: Options) -> Non
 @param_verb(
     argument("key", param_names),
     argument("value", required=False),
-    click.option("-t", "--textfile", metavar="FILE", help="Set it to this file's text."),
-    click.option("-b", "--binfile", metavar="FILE", help="Set it to this file's bytes."),
+    option("-t --textfile", "FILE", "Set it to this file's text."),
+    option("-b --binfile", "FILE", "Set it to this file's bytes."),
     context_settings={"ignore_unknown_options": True},
 )
 def param_set(

@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-import click
 import msgspec
 
-from rmpa.cli.completion import peers
 from rmpa.cli.graph import find_peer, shown_state, suggestion
-from rmpa.cli.options import Options, Selection, agent_verb, argument, flag, limit_options, ping_options, summary
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    agent_verb,
+    argument,
+    flag,
+    limit_options,
+    option,
+    peers,
+    ping_options,
+    pings,
+    summary,
+)
 from rmpa.cli.output import Table, duration, printable, size, warn
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
-from rmpa.observe.control import GATEWAY_REPORT
-from rmpa.observe.peers import PENDING
-from rmpa.observe.sites import SitesReport
-from rmpa.observe.snapshot import ModuleFacts, PingReply
+from rmpa.observe.control_client import GATEWAY_REPORT
+from rmpa.observe.sites import REPORT, SITE_INFO, SitesReport
+from rmpa.observe.snapshot import PENDING, ModuleFacts, PingReply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -60,8 +68,8 @@ MODULE_FACTS: Final[tuple[tuple[str, Callable[[ModuleFacts], str]], ...]] = (
 
 @agent_verb(
     argument("pattern", peers, default=""),
-    flag("-v", "--verbose", help="With the side that dialled, clock, traffic, queue and drops."),
-    click.option("--state", "states", multiple=True, help="Only peers in this state; may be given again."),
+    flag("-v --verbose", "With the side that dialled, clock, traffic, queue and drops."),
+    option("--state states", help="Only peers in this state; may be given again.", multiple=True),
     *limit_options,
 )
 def peer_list(
@@ -87,27 +95,23 @@ def peer_list(
     """
     with options.client() as client:
         snapshot = client.snapshot(topics=())
-    selection = Selection(pattern, limit=limit, everything=everything)
+    selection = Selection(pattern, limit=limit, everything=everything or options.as_json)
     known = (*snapshot.peers, *snapshot.strangers)
     peers = [p for p in known if selection.wants(p.name, ()) and (not states or p.state in states)]
 
     def text() -> Iterator[Text]:
-        shown = peers
         if not known:
             where = ", ".join(snapshot.agent.interfaces) or "no interface"
             yield f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})"
         elif not peers:
             yield summary(len(known), "peers", (p.state for p in known)) + "; none of them matches"
         else:
-            if selection.is_long(peers):
-                yield summary(len(peers), "peers", (p.state for p in peers))
-                yield ""
-                shown = sorted(peers, key=_urgency)
             titles = _BRIEF + (", DIALLED, >CLOCK, >IN, >OUT, >QUEUE, >DROPS" if verbose else "")
-            shown = shown[: selection.lines]
+            shown = selection.first(peers, _urgency)
             rows = [_row(p)[: titles.count(",") + 1] for p in shown]
-            yield Table(titles, rows, [_COLOURS.get(p.state, "") for p in shown])
-            yield selection.rest(peers, "peers", "rmpa peer list 'arm*', --state linked")
+            about = summary(len(peers), "peers", (p.state for p in peers))
+            table = Table(titles, rows, [_COLOURS.get(p.state, "") for p in shown])
+            yield selection.framed(peers, "peers", about, "rmpa peer list 'arm*', --state linked", table)
         troubles = _troubles(snapshot, sorted(peers, key=_urgency) if selection.is_long(peers) else peers)
         for trouble in troubles[: selection.lines]:
             warn(*trouble)
@@ -268,10 +272,7 @@ def peer_ping(name: str, count: int | None, interval: float, options: Options) -
     with options.client() as client:
         found = find_peer(client.snapshot(topics=()), name)
         with contextlib.suppress(KeyboardInterrupt):
-            while count is None or sent < count:
-                if sent:
-                    time.sleep(interval)
-                sent += 1
+            for sent in pings(count, interval):
                 _ping_once(client, found, sent, times, options)
     of = SampleSpread.of(times)
     figures = {"min": of.min, "avg": of.mean, "max": of.max, "sd": of.sd}
@@ -299,7 +300,7 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
         options.show(shown, f"{peer.name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
 
 
-name_option = click.option("--name", metavar="GATEWAY", help="Ask this gateway of this machine, not --agent's.")
+name_option = option("--name", "GATEWAY", "Ask this gateway of this machine, not --agent's.")
 
 
 def _connect(options: Options, name: str | None) -> ControlClient:
@@ -308,11 +309,7 @@ def _connect(options: Options, name: str | None) -> ControlClient:
 
 def _ask(client: ControlClient, what: str, kind: type[_T], **args: object) -> _T:
     try:
-        value: object = client.call("site", object, what=what, args=args)
-    except PeerRefused as error:
-        raise RmpaError(error.reason, code=error.code) from None  # the agent only passes on what a gateway says
-    try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(client.pass_on("site", object, what=what, args=args), kind)
     except msgspec.ValidationError as error:
         raise RemoteProtocolError(f"the gateway answers in another way: {error}; is it another version?") from None
 
@@ -332,8 +329,6 @@ def site_list(name: str | None, options: Options) -> int:
       rmpa site list --name store-gateway
       rmpa site list --json | jq -r '.[].sites[].name'
     """
-    from rmpa.observe.sites import REPORT
-
     with _connect(options, name) as client:
         reports = _ask(client, REPORT, tuple[SitesReport, ...])
         if not reports:
@@ -387,8 +382,6 @@ def site_info(site: str, name: str | None, options: Options) -> int:
       rmpa site info warehouse
       rmpa site info hall --json | jq '.sites[0].sources[] | select(.here=="")'
     """
-    from rmpa.observe.sites import SITE_INFO
-
     with _connect(options, name) as client:
         report = _ask(client, SITE_INFO, SitesReport, site=site)
     found = next((each for each in report.sites if each.name == site), None)

@@ -18,7 +18,7 @@ import click
 import msgspec
 
 from rmpa.cli.module import check_record
-from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb
+from rmpa.cli.options import FiniteRange, Options, argument, flag, graph_verb, json_verb, option, output_option
 from rmpa.cli.output import Table, paint, print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.runtime.tasks import start_task
@@ -36,16 +36,16 @@ _COLOURS: Final = {"error": "red", "warn": "yellow", "info": ""}
 
 @graph_verb(
     argument("recording", type=_RECORDING),
-    click.option("-r", "--rate", type=FiniteRange(0.001), default=1.0, help="So many times as fast."),
-    click.option("-s", "--start", type=FiniteRange(0), default=0.0, metavar="SECONDS", help="Leave out so much."),
-    click.option("-u", "--duration", type=FiniteRange(0.01), metavar="SECONDS", help="Play so much."),
-    flag("-l", "--loop", help="Begin again at the end."),
-    flag("--clock", help="Publish /clock, and set /use_sim_time while it plays."),
-    flag("--pause", "paused", help="Begin with a pause."),
-    click.option("-t", "--topic", "globs", multiple=True, metavar="GLOB", help="Only these topics."),
-    click.option("--not", "deny", multiple=True, metavar="GLOB", help="Not these topics."),
-    click.option("-m", "--module", "modules", multiple=True, metavar="MODULE", help="Only what these modules said."),
-    flag("--over", help="Play topics that other nodes publish, too."),
+    option("-r --rate", help="So many times as fast.", type=FiniteRange(0.001), default=1.0),
+    option("-s --start", "SECONDS", "Leave out so much.", type=FiniteRange(0), default=0.0),
+    option("-u --duration", "SECONDS", "Play so much.", type=FiniteRange(0.01)),
+    flag("-l --loop", "Begin again at the end."),
+    flag("--clock", "Publish /clock, and set /use_sim_time while it plays."),
+    flag("--pause paused", "Begin with a pause."),
+    option("-t --topic globs", "GLOB", "Only these topics.", multiple=True),
+    option("--not deny", "GLOB", "Not these topics.", multiple=True),
+    option("-m --module modules", "MODULE", "Only what these modules said.", multiple=True),
+    flag("--over", "Play topics that other nodes publish, too."),
     argument("remap", nargs=-1, metavar="[OLD:=NEW]..."),
 )
 def play(recording: Path, paused: bool, remap: tuple[str, ...], options: Options, **given: Any) -> int:
@@ -149,7 +149,7 @@ def _keys(player: Player, task: asyncio.Task[None]) -> Iterator[None]:
 @json_verb(
     argument("first", type=_RECORDING),
     argument("second", type=_RECORDING),
-    flag("--all", "everything", help="Also equal topics."),
+    flag("--all everything", "Also equal topics."),
 )
 def diff(first: Path, second: Path, everything: bool, options: Options) -> int:
     """Compare two recordings, topic by topic: messages, rates, gaps, ages, and the first message that differs.
@@ -204,10 +204,8 @@ def _at(_context: click.Context, _parameter: click.Parameter, text: str | None) 
 
 @json_verb(
     argument("recording", type=_RECORDING),
-    click.option(
-        "--at", callback=_at, metavar="TIME", help="Only the half minute around it: 58 (s), 12:15:58 (UTC)."
-    ),
-    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write it: .md or .html."),
+    option("--at", "TIME", "Only the half minute around it: 58 (s), 12:15:58 (UTC).", callback=_at),
+    output_option("Write it: .md or .html."),
 )
 def story(recording: Path, at: float | time.struct_time | None, output: Path | None, options: Options) -> int:
     """Say what happened in a RECORDING: alarms, lost links, missed deadlines, profiles, gaps, errors, in order.

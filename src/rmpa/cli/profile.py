@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 import msgspec
 
-from rmpa.cli.completion import completes
-from rmpa.cli.options import Options, argument, flag, graph_verb
-from rmpa.cli.output import Table, warn
-from rmpa.cli.resource import known_name, resource_names, resource_verb, run_with_resources, status_of
+from rmpa.cli.graph import suggestion
+from rmpa.cli.options import Options, argument, completes, flag, graph_verb, options_of
+from rmpa.cli.output import Table, printable, warn
+from rmpa.cli.resource import resource_names, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.quality import MEASURED
 from rmpa.ros.types.definitions import ARRAY_TYPE
@@ -130,11 +130,11 @@ def _set_verb(what: str, auto: str) -> Callable[[Callable[..., Any]], click.Comm
             one = graph.pick(ctx.params.get("resource")).descriptor
             return [each.name for each in (one.profiles if what == "profile" else one.contexts)]
 
-        return run_with_resources(Options(False, ctx.params.get("agent"), ctx.params.get("master")), names)
+        return run_with_resources(options_of(ctx), names)
 
     complete = completes(offered, "rmpa.ros.node.node")
     name = click.argument("name", required=False, metavar=f"[{what.upper()}]", shell_complete=complete)
-    return graph_verb(argument("resource", resource_names), name, flag("--auto", help=auto))
+    return graph_verb(argument("resource", resource_names), name, flag("--auto", auto))
 
 
 def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Options) -> None:
@@ -146,8 +146,10 @@ def _set(what: str, resource: str, name: str | None, *, auto: bool, options: Opt
         offered: Sequence[Any] = one.descriptor.profiles if what == "profile" else one.descriptor.contexts
         if not offered:
             raise ConfigError("RESOURCE", f"{one} has no {what}s", "")
-        if name is not None:
-            known_name(what, name, (each.name for each in offered))
+        names = [each.name for each in offered]
+        if name is not None and name not in names:
+            remedy = suggestion(name, names, f"there are {printable(', '.join(names))}")
+            raise ConfigError(what.upper(), f"there is no {what} {name!r}", remedy)
         await graph.configure(one, {what: name or ""})
         options.show({**one.named, "chosen": name or ""})
 

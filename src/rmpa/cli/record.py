@@ -1,39 +1,37 @@
-"""``rmpa record``: the flight recorder of this module, and the recordings of all."""
+"""``rmpa record``: the flight recorder of this module, and recordings into a file: of this module, or of all."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.completion import completes, peers, topics
 from rmpa.cli.main import LazyGroup
 from rmpa.cli.module import check_record, find_module
 from rmpa.cli.options import (
     FiniteRange,
     Options,
     agent_option,
-    agent_verb,
-    argument,
     config_option,
     flag,
     json_option,
-    json_verb,
+    option,
+    output_option,
+    peers,
+    topics,
 )
-from rmpa.cli.output import Table, begin_log, size
+from rmpa.cli.output import begin_log, size
 from rmpa.cli.recordings import (
-    BAG,
     CALL,
-    MB,
-    PROGRESS,
+    NO_RECORDER,
     all_recordings,
     end_line,
     fetch,
@@ -41,49 +39,40 @@ from rmpa.cli.recordings import (
     keep,
     merged,
     parts_folder,
-    parts_of,
-    record_mesh,
     say,
+    writable,
 )
 from rmpa.core.errors import ConfigError, RmpaError, StartError
-from rmpa.observe.operations import remove_recording
+from rmpa.core.identity import matches_any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
 
-    from rmpa.bridge.kept import Kept
     from rmpa.bridge.recordings import ModuleRecordings
     from rmpa.cli.module import Module
 
+    _ByModule = dict[str, ModuleRecordings]
+
 _log = logging.getLogger("rmpa.record")
-_SECOND: Final = 1_000_000_000
+_MB: Final = 1_000_000
+# Seconds between two lines of progress.
+_PROGRESS: Final = 0.5
+# Seconds between two looks at what the recorders of a mesh have; they tell it every 5 s.
+_LOOK: Final = 2.0
+# Seconds of a ring that tell how many it will hold, and the share of its bytes above which it has dropped some.
+_SURE: Final = 10.0
+_FULL: Final = 0.75
 
 
 @click.group(cls=LazyGroup, path="record", invoke_without_command=True, help=None)
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Record into this file: .mcap or .bag."
-)
-@click.option(
-    "-t",
-    "--topic",
-    "globs",
-    multiple=True,
-    metavar="GLOB",
-    shell_complete=completes(topics),
-    help="Only these topics.",
-)
-@click.option("--duration", type=FiniteRange(0.1), metavar="SECONDS", help="Stop after so long. [default: at Ctrl-C]")
-@click.option("--size", "megabytes", type=FiniteRange(0.1), metavar="MB", help="Stop after so many MB of messages.")
-@flag("--here", help="Record what nodes of other modules publish, too: it crosses the network.")
-@flag("--mesh", help="Let all modules record their own nodes by their recorders, then fetch and merge that.")
-@click.option(
-    "--peer",
-    "peers",
-    multiple=True,
-    metavar="NAME",
-    shell_complete=completes(peers),
-    help="As --mesh, of these modules alone.",
-)
+@output_option("Record into this file: .mcap or .bag.")
+@option("-t --topic globs", "GLOB", "Only these topics.", multiple=True, find=topics)
+@option("--duration", "SECONDS", "Stop after so long. [default: at Ctrl-C]", type=FiniteRange(0.1))
+@option("--size megabytes", "MB", "Stop after so many MB of messages.", type=FiniteRange(0.1))
+@flag("--here", "Record what nodes of other modules publish, too: it crosses the network.")
+@flag("--mesh", "Let all modules record their own nodes by their recorders, then fetch and merge that.")
+@option("--peer peers", "NAME", "As --mesh, of these modules alone.", multiple=True, find=peers)
 @config_option
 @json_option
 @agent_option
@@ -114,15 +103,14 @@ def record(context: click.Context, /, config: str | None, as_json: bool, agent: 
         if any(given[key] for key in ("globs", "duration", "megabytes", "here", "mesh", "peers")):
             raise ConfigError("-o", "these options are for a recording into a file", "add -o FILE.mcap or FILE.bag")
         return _ring(module)
-    if given["output"].exists():
-        raise ConfigError("-o", f"{given['output']} exists", "name another file")
+    writable(given["output"])
     if given["mesh"] or given["peers"]:
         if given["here"]:
             text = "--here gathers over the network while it records, --mesh and --peer at the end"
             raise ConfigError("--here", text, "use one of them")
         if given["mesh"] and given["peers"]:
             raise ConfigError("--peer", "--mesh is all modules", "use one of them")
-        return record_mesh(options, _file(given["output"]), given)
+        return _mesh(options, given["output"], given)
     return _by_hand(module, options, given)
 
 
@@ -134,9 +122,8 @@ def _ring(module: Module) -> int:
     begin_log(settings, module.loaded.notes, _log, sys.stderr)
     folder = module_dir(module.place, module.name) / "record"
     recorder = Recorder(settings.record, folder, module.name, core)
-    _log.info(
-        "= recording into %s: the last %g s, %d MB", folder, settings.record.seconds or 0, settings.record.megabytes
-    )
+    seconds = settings.record.seconds or 0
+    _log.info("= recording into %s: the last %g s, %d MB", folder, seconds, settings.record.megabytes)
     asyncio.run(_until_signal(recorder.run))
     return 0
 
@@ -157,256 +144,157 @@ async def _until_signal(run: Callable[[asyncio.Event], Any]) -> None:
     await run(stop)
 
 
-def _file(path: Path) -> Path:
-    """A file that a recording goes to.
-
-    Raises:
-        ConfigError: Its name does not say as what.
-    """
-    if path.suffix not in (BAG, ".mcap"):
-        raise ConfigError("-o", f"{path} is neither .mcap nor .bag", "name the file so")
-    return path
-
-
 def _by_hand(module: Module, options: Options, given: dict[str, Any]) -> int:
     """Record into a file: segments beside it, which are joined at the end."""
     from rmpa.record.recorder import record_file
 
-    settings = module.loaded.settings
-    wanted = replace(
-        settings.record, topics=given["globs"] or ("/**",), topic_rate=None, total_rate=None, thin=None, deny=()
-    )
-    shown = 0.0
+    shown, topics = 0.0, given["globs"] or ("/**",)
+    bare = replace(module.loaded.settings.record, topic_rate=None, total_rate=None, thin=None, deny=())
 
     def progress(seconds: float, messages: int, total: int) -> bool:
         nonlocal shown
-        if seconds - shown >= PROGRESS:
+        if seconds - shown >= _PROGRESS:
             shown = seconds
             say(f"{seconds:6.1f} s  {messages:,} messages  {size(total)}")
-        return bool(given["megabytes"]) and total >= given["megabytes"] * MB
+        return bool(given["megabytes"]) and total >= given["megabytes"] * _MB
 
-    output = _file(given["output"])
+    output: Path = given["output"]
     with parts_folder(output) as parts:
-        counts = asyncio.run(
-            record_file(
-                wanted,
-                parts,
-                module.name,
-                _core_of(module),
-                progress,
-                given["duration"],
-                everything=given["here"],
-            )
-        )
+        asked = replace(bare, topics=topics), parts, module.name, _core_of(module), progress, given["duration"]
+        counts = asyncio.run(record_file(*asked, everything=given["here"]))
         end_line()
         result = join([parts], output)
-    options.show(
-        {"file": str(output), "messages": result.count, "topics": counts},
-        f"{output}: {result.count:,} messages of {len(counts)} topics, {size(output.stat().st_size)}",
-    )
+    about = {"file": str(output), "messages": result.count, "topics": counts}
+    text = f"{output}: {result.count:,} messages of {len(counts)} topics, {size(output.stat().st_size)}"
+    options.show(about, text)
     return 0 if result.count else 1
 
 
-def names(_ctx: click.Context, _: str) -> Iterator[str]:
-    """The names of recordings, for completion."""
-    with Options(False).client() as client:
-        yield from dict.fromkeys(kept.id for each in all_recordings(client) for kept in each.kept)
+def _mesh(options: Options, output: Path, given: dict[str, Any]) -> int:
+    """Let modules record their own nodes for a time, by the rings of their recorders; fetch and merge that.
 
-
-@agent_verb()
-def record_list(options: Options) -> int:
-    """List what the modules have kept, and what their recorders do.
-
-    ---
-
-    Examples:
-      rmpa record list
-      rmpa record list --json | jq -r '.[].kept[].id'
+    Args:
+        options: Of the command.
+        output: The file.
+        given: The values of the command's options.
     """
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)  # as Ctrl-C
     with options.client(CALL) as client:
-        found = all_recordings(client)
-    recorders = [
-        (each.module, *(_state(each)), each.problem or str(each.status.get("problem", "")) or "-") for each in found
-    ]
-    by_id: dict[str, list[tuple[str, Kept]]] = {}
-    for each in found:
-        for kept in each.kept:
-            by_id.setdefault(kept.id, []).append((each.module, kept))
-    rows = [
-        (name, ", ".join(module for module, _ in parts), size(sum(kept.size for _, kept in parts)), parts[0][1].why)
-        for name, parts in sorted(by_id.items())
-    ]
-    options.show(
-        found,
-        Table("MODULE, RECORDER, >BACK, >RING, >WRITTEN, PROBLEM", recorders),
-        "",
-        Table("RECORDING, MODULES, >SIZE, WHY", rows),
-    )
-    return int(any(each.problem for each in found))
-
-
-def _state(each: ModuleRecordings) -> tuple[str, str, str, str]:
-    status = each.status
-    if not status:
-        return "-", "-", "-", "-"
-    total, back = status.get("ring", (0, 0.0))
-    hours = max(status["at"] - status["since"], 1.0) / 3600
-    return "runs", f"{back:.0f} s", size(total), f"{size(status.get('written', 0) / hours)}/h"
-
-
-@agent_verb(argument("recording", names))
-def record_info(recording: str, options: Options) -> int:
-    """Show what is known of a RECORDING, at each module that has it.
-
-    ---
-
-    Examples:
-      rmpa record info 20261129-121500-arm-alarm
-    """
-    with options.client(CALL) as client:
-        parts = parts_of(client, recording)
-    rows = [
-        (
-            module,
-            _clock(kept.since),
-            f"{(kept.until - kept.since) / _SECOND:.0f} s",
-            str(len(kept.files)),
-            size(kept.size),
-        )
-        for module, kept in parts
-    ]
-    kept = parts[0][1]
-    about = f"{kept.id}: {kept.why}" + (f" (asked by {kept.asked_by})" if kept.asked_by else "")
-    options.show([kept for _, kept in parts], about, Table("MODULE, SINCE (UTC), >LENGTH, >FILES, >SIZE", rows))
-    return 0
-
-
-def _clock(at: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(at / _SECOND))
-
-
-@agent_verb(
-    argument("why", required=False, default="by hand"),
-    click.option("--seconds", type=FiniteRange(0.1), help="How much of the past. [default: all that is there]"),
-    click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Fetch and merge it, too."),
-)
-def record_keep(why: str, seconds: float | None, output: Path | None, options: Options) -> int:
-    """Keep what all modules have of the last minutes; WHY names it.
-
-    Modules that are not linked keep it when they are back. Exits 1 if a module cannot.
-
-    ---
-
-    Examples:
-      rmpa record keep
-      rmpa record keep "the arm hit the table" --seconds 60 -o hit.mcap
-    """
-    if output is not None and _file(output).exists():
-        raise ConfigError("-o", f"{output} exists", "name another file")
-    with options.client(CALL) as client:
-        name, answers = keep(client, why, seconds)
-        rows = [(module, problem or "kept") for module, problem in answers.items()]
-        about: dict[str, Any] = {"id": name, "modules": answers}
-        lines: list[str] = []
-        if output is not None and name:
-            with parts_folder(output) as folder:
-                fetched = fetch(client, name, folder)
-                result = join([folder], output)
-            about |= {"file": str(output), "messages": result.count}
-            lines = [*merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
-            answers |= {one.module: one.problem for one in fetched if one.problem}
-    options.show(about, name, Table("MODULE, STATE", rows), *lines)
-    return int(not name or any(answers.values()))
-
-
-@agent_verb(
-    argument("recording", names),
-    click.option(
-        "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Where to. [default: ./RECORDING]"
-    ),
-)
-def record_fetch(recording: str, output: Path | None, options: Options) -> int:
-    """Fetch a RECORDING from all modules that have it, a folder each; what is there already is not fetched again.
-
-    A module whose link is lost meanwhile is waited for, a minute long. The same command goes on where one was ended.
-    Commands do not wait for it: it takes half of the way at the most.
-
-    ---
-
-    Examples:
-      rmpa record fetch 20261129-121500-arm-alarm
-      rmpa record fetch 20261129-121500-arm-alarm -o fall
-    """
-    folder = output or Path(recording)
+        recorders, problems = _recorders(all_recordings(client), given["peers"])
+        until = _bounds(recorders, given["duration"])
+    for module, problem in problems.items():
+        click.echo(f"! {module} is not recorded: {problem}", err=True)
+    if given["duration"] is None:
+        click.echo(f"= it ends by itself after {until:.0f} s: so much the rings hold ([record] seconds)", err=True)
+    began = time.monotonic()
+    with contextlib.suppress(KeyboardInterrupt):
+        _wait(options, recorders, until, given)
+    end_line()
+    seconds, name = time.monotonic() - began, ""
     try:
-        with options.client(CALL) as client:
-            fetched = fetch(client, recording, folder)
-    except KeyboardInterrupt:
-        click.echo(f"\nnot all is in {folder}: the same command goes on from there", err=True)
-        raise
-    problems = {one.module: one.problem for one in fetched if one.problem}
-    options.show(
-        {"folder": str(folder), "modules": {one.module: one.size for one in fetched}, "problems": problems},
-        Table("MODULE, >SIZE, PROBLEM", [(one.module, size(one.size), one.problem or "-") for one in fetched]),
-        "not all is there: the same command goes on from there"
-        if problems
-        else f"merge it: rmpa record merge {folder} -o {recording}.mcap",
-    )
-    return int(bool(problems))
+        with options.client(CALL) as client, parts_folder(output) as folder:
+            name, answers = keep(client, f"by hand for {seconds:.0f} s", seconds, given["peers"])
+            ends = {each.module: each for each in all_recordings(client) if each.module in recorders}
+            problems |= _missing(recorders, ends, answers, seconds)
+            if not name:
+                text = "; ".join(f"{module}: {problem}" for module, problem in problems.items())
+                raise RmpaError(f"no module has kept it: {text}", code="recording-stopped")
+            fetched = fetch(client, name, folder, recorders)
+            problems |= {one.module: one.problem for one in fetched if one.problem}
+            result = join([folder], output, "", given["globs"])
+            if not any(one.problem for one in fetched):
+                for one in fetched:
+                    client.call("record", object, what="remove", module=one.module, id=name)
+                name = ""
+    finally:
+        if name:
+            click.echo(f"the modules have it as {name}: rmpa record fetch {name}", err=True)
+    left = {one: count for one in ends if (count := _grown({one: recorders[one]}, ends, "left_out", given["globs"]))}
+    about = {"file": str(output), "messages": result.count, "modules": list(result.offsets)}
+    lines = [f"! {module}: {problem}" for module, problem in problems.items()]
+    above = "messages above its [record] topic_rate, total_rate or thin"
+    lines += [f"= {module}: {count:,} {above}" for module, count in left.items()]
+    options.show({**about, "problems": problems, "left_out": left}, *merged(output, result), *lines)
+    return int(bool(problems) or not result.count)
 
 
-@json_verb(
-    argument("recordings", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)),
-    click.option(
-        "-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FILE", help=".mcap or .bag."
-    ),
-    click.option("--clock", "reference", default="", metavar="MODULE", help="Whose clock. [default: the best known]"),
-)
-def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, options: Options) -> int:
-    """Put RECORDINGS of several modules on one timeline: files, or folders as `rmpa record fetch` makes them.
+def _recorders(found: Iterable[ModuleRecordings], wanted: Sequence[str]) -> tuple[_ByModule, dict[str, str]]:
+    """The modules that record, and by module why others do not.
 
-    ---
-
-    Examples:
-      rmpa record merge fall -o fall.mcap
-      rmpa record merge arm.mcap base.mcap --clock base -o both.bag
+    Raises:
+        RmpaError: None does.
     """
-    check_record("rmpa record")
-    result = join(list(recordings), _file(output), reference)
-    about = {
-        "file": str(output),
-        "reference": result.reference,
-        "offsets": {name: one._asdict() for name, one in result.offsets.items()},
-        "messages": result.count,
-        "doubles": result.doubles,
-        "damaged": list(result.damaged.values()),
-        "notes": result.notes,
-    }
-    rows = [
-        (name, "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms", _bound(one.error))
-        for name, one in result.offsets.items()
-    ]
-    options.show(about, *merged(output, result), Table("MODULE, >AHEAD, >±", rows))
-    return int(bool(result.damaged))
+    all_of = {each.module: each for each in found if not wanted or each.module in wanted}
+    problems = {name: "it is not linked; `rmpa peer list` shows why" for name in wanted if name not in all_of}
+    for name, each in all_of.items():
+        if each.problem or not each.status:
+            problems[name] = each.problem or NO_RECORDER
+    recorders = {name: each for name, each in all_of.items() if name not in problems}
+    if not recorders:
+        text = "; ".join(f"{name}: {problem}" for name, problem in problems.items())
+        raise RmpaError(f"no module records: {text}", code="no-recorder")
+    return recorders, problems
 
 
-def _bound(error: float | None) -> str:
-    return "not known" if error is None else f"{1e3 * error:.3f} ms"
+def _bounds(recorders: _ByModule, duration: float | None) -> float:
+    """For how long to record.
 
-
-@agent_verb(argument("recording", names), click.option("--module", default="", help="Only that of this module."))
-def record_rm(recording: str, module: str, options: Options) -> int:
-    """Remove a RECORDING at all modules that have it.
-
-    ---
-
-    Examples:
-      rmpa record rm 20261129-121500-arm-alarm
+    Raises:
+        ConfigError: A ring is too short for that.
     """
+    least, shortest = float("inf"), ""
+    for name, each in recorders.items():
+        most, seconds = each.status.get("bounds", (0, None))
+        total, back = each.status.get("ring", (0, 0.0))
+        by_size = most * back / total if total and back > _SURE else float("inf")
+        if (holds := min(seconds or float("inf"), by_size)) < least:
+            least, shortest = holds, name
+    if duration is not None and duration > least:
+        text = f"{duration:g} s are asked for, and the ring of {shortest} holds the last {least:.0f} s"
+        remedy = "set [record] seconds or megabytes there, or record with -o at the module"
+        raise ConfigError("--duration", text, remedy)
+    return duration or min(least, 86_400.0)
+
+
+def _wait(options: Options, recorders: _ByModule, seconds: float, given: dict[str, Any]) -> None:
+    """Wait for the end, with progress; Ctrl-C raises ``KeyboardInterrupt``."""
+    began = looked = time.monotonic()
+    messages = total = 0
     with options.client(CALL) as client:
-        removed, problems = remove_recording(client, recording, module)
-    if not removed and not problems:
-        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
-    rows = [*((name, "removed") for name in removed), *problems.items()]
-    options.show({"removed": removed, "problems": problems}, Table("MODULE, STATE", rows))
-    return int(bool(problems))
+        while (rest := began + seconds - time.monotonic()) > 0:
+            time.sleep(min(rest, _PROGRESS))
+            if time.monotonic() - looked > _LOOK and (sys.stderr.isatty() or given["megabytes"]):
+                now = {each.module: each for each in all_recordings(client)}
+                messages, total = (_grown(recorders, now, what, given["globs"]) for what in ("messages", "size"))
+                looked = time.monotonic()
+            took = time.monotonic() - began
+            say(f"{took:6.1f} s  {len(recorders)} modules  {messages:,} messages  {size(total)}")
+            if given["megabytes"] and total >= given["megabytes"] * _MB:
+                return
+
+
+def _grown(before: _ByModule, now: _ByModule, what: str, globs: Sequence[str]) -> int:
+    """By how much the recorders' counts of topics have grown."""
+    total = 0
+    for name, each in before.items():
+        then = each.status.get(what, {})
+        later = now[name].status.get(what, {}) if name in now else {}
+        wanted = (topic for topic in later if not globs or matches_any(globs, topic))
+        total += sum(max(0, later[topic] - then.get(topic, 0)) for topic in wanted)
+    return total
+
+
+def _missing(before: _ByModule, now: _ByModule, answers: dict[str, str], seconds: float) -> dict[str, str]:
+    """By module what of the time cannot be had, and why."""
+    problems = {}
+    for name in before:
+        status = now[name].status if name in now else {}
+        (most, _), (total, back) = status.get("bounds", (0, None)), status.get("ring", (0, seconds))
+        if name not in answers:
+            problems[name] = "it is not linked any more"
+        elif answers[name]:
+            problems[name] = answers[name]
+        elif total > _FULL * most > 0 and back < seconds:
+            problems[name] = f"the first {seconds - back:.0f} s are missing: its ring is full ([record] megabytes)"
+    return problems

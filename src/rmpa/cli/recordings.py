@@ -1,14 +1,14 @@
-"""What ``rmpa record`` does with recordings of other modules: they are kept, fetched and joined into one file."""
+"""Recordings that modules have kept: ``rmpa record list|info|keep|fetch|merge|rm``."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
 import shutil
-import signal
 import sys
 import time
 import zlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
@@ -16,25 +16,24 @@ import click
 from rmpa.bridge.kept import recording_id
 from rmpa.bridge.limits import RECORDING_PART
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
-from rmpa.cli.output import printable, size
+from rmpa.cli.module import check_record
+from rmpa.cli.options import FiniteRange, Options, agent_verb, argument, json_verb, option, options_of, output_option
+from rmpa.cli.output import Table, printable, size
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
-from rmpa.core.identity import matches_any
 from rmpa.core.limits import KIB
+from rmpa.observe.operations import remove_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Collection, Iterator, Sequence
 
     from rmpa.bridge.kept import Kept
-    from rmpa.cli.options import Options
     from rmpa.observe.control_client import ControlClient
     from rmpa.record.merge import Timeline
 
-BAG: Final = ".bag"
-MB: Final = 1_000_000
+_BAG: Final = ".bag"
+_SECOND: Final = 1_000_000_000
+_BLOCK: Final = 1_000_000
 NO_RECORDER: Final = "no recorder runs there; start one: `rmpa record`, or [record] enabled = true"
-# Seconds between two lines of progress.
-PROGRESS: Final = 0.5
 # Seconds that a command to all modules may take.
 CALL: Final = 60.0
 # A part of a file takes the way from its module for about so many seconds, and then the way is free as long: behind
@@ -49,16 +48,11 @@ _KEPT_WITHIN: Final = 20.0
 # Seconds for which a module that is not linked is waited for, and between two tries.
 _AWAY: Final = 60.0
 _AGAIN: Final = 0.5
-# Seconds between two looks at what the recorders of a mesh have; they tell it every 5 s.
-_LOOK: Final = 2.0
-# Seconds of a ring that tell how many it will hold, and the share of its bytes above which it has dropped some.
-_SURE: Final = 10.0
-_FULL: Final = 0.75
 
 
-def all_recordings(client: ControlClient) -> list[ModuleRecordings]:
+def all_recordings(client: ControlClient) -> tuple[ModuleRecordings, ...]:
     """The recordings of this module and of those that are linked."""
-    return list(client.call("record", tuple[ModuleRecordings, ...], what="list"))
+    return client.call("record", tuple[ModuleRecordings, ...], what="list")
 
 
 def parts_of(client: ControlClient, recording: str) -> list[tuple[str, Kept]]:
@@ -96,16 +90,27 @@ def parts_folder(output: Path) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
+def writable(output: Path) -> None:
+    """Check that a recording can go to a file.
+
+    Raises:
+        ConfigError: The file is there, or its name does not say as what.
+    """
+    if output.exists():
+        raise ConfigError("-o", f"{output} exists", "name another file")
+    if output.suffix not in (_BAG, ".mcap"):
+        raise ConfigError("-o", f"{output} is neither .mcap nor .bag", "name the file so")
+
+
 def join(paths: list[Path], output: Path, reference: str = "", topics: Sequence[str] = ()) -> Timeline:
     """Merge recordings into one file, MCAP or bag; ``topics``: only those, by globs, and events."""
     from rmpa.record.bag import write_bag
     from rmpa.record.merge import Timeline
 
-    if output.exists():
-        raise ConfigError("-o", f"{output} exists", "name another file")
+    writable(output)
     timeline, whole = Timeline(paths, reference, topics), output.with_name(f".{output.name}.new")
     try:
-        if output.suffix == BAG:
+        if output.suffix == _BAG:
             write_bag(timeline.messages(), whole)
         else:
             with whole.open("wb") as file:
@@ -221,7 +226,7 @@ def _read(client: ControlClient, module: str, **args: Any) -> FilePart:
 def _checksum(path: Path) -> int:
     found = 0
     with path.open("rb") as file:
-        while block := file.read(MB):
+        while block := file.read(_BLOCK):
             found = zlib.crc32(block, found)
     return found
 
@@ -276,146 +281,177 @@ def end_line() -> None:
         click.echo("", err=True)
 
 
-def record_mesh(options: Options, output: Path, given: dict[str, Any]) -> int:
-    """Let modules record their own nodes for a time, by the rings of their recorders; fetch and merge that.
+def _names(ctx: click.Context, _: str) -> Iterator[str]:
+    """The names of recordings, for completion."""
+    with options_of(ctx).client() as client:
+        yield from dict.fromkeys(kept.id for each in all_recordings(client) for kept in each.kept)
 
-    Args:
-        options: Of the command.
-        output: The file.
-        given: The values of the command's options.
+
+@agent_verb()
+def record_list(options: Options) -> int:
+    """List what the modules have kept, and what their recorders do.
+
+    ---
+
+    Examples:
+      rmpa record list
+      rmpa record list --json | jq -r '.[].kept[].id'
     """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # as Ctrl-C
     with options.client(CALL) as client:
-        recorders, problems = _recorders(all_recordings(client), given["peers"])
-        until = _bounds(recorders, given["duration"])
-    for module, problem in problems.items():
-        click.echo(f"! {module} is not recorded: {problem}", err=True)
-    if given["duration"] is None:
-        click.echo(f"= it ends by itself after {until:.0f} s: so much the rings hold ([record] seconds)", err=True)
-    began = time.monotonic()
-    with contextlib.suppress(KeyboardInterrupt):
-        _wait(options, recorders, until, given)
-    end_line()
-    seconds, name = time.monotonic() - began, ""
+        found = all_recordings(client)
+    recorders = [(each.module, *_state(each), each.problem or each.status.get("problem") or "-") for each in found]
+    by_id: dict[str, list[tuple[str, Kept]]] = {}
+    for each in found:
+        for kept in each.kept:
+            by_id.setdefault(kept.id, []).append((each.module, kept))
+    rows = [
+        (name, ", ".join(module for module, _ in parts), size(sum(kept.size for _, kept in parts)), parts[0][1].why)
+        for name, parts in sorted(by_id.items())
+    ]
+    table = Table("MODULE, RECORDER, >BACK, >RING, >WRITTEN, PROBLEM", recorders)
+    options.show(found, table, "", Table("RECORDING, MODULES, >SIZE, WHY", rows))
+    return int(any(each.problem for each in found))
+
+
+def _state(each: ModuleRecordings) -> tuple[str, str, str, str]:
+    status = each.status
+    if not status:
+        return "-", "-", "-", "-"
+    total, back = status.get("ring", (0, 0.0))
+    hours = max(status["at"] - status["since"], 1.0) / 3600
+    return "runs", f"{back:.0f} s", size(total), f"{size(status.get('written', 0) / hours)}/h"
+
+
+@agent_verb(argument("recording", _names))
+def record_info(recording: str, options: Options) -> int:
+    """Show what is known of a RECORDING, at each module that has it.
+
+    ---
+
+    Examples:
+      rmpa record info 20261129-121500-arm-alarm
+    """
+    with options.client(CALL) as client:
+        parts = parts_of(client, recording)
+    rows = []
+    for module, kept in parts:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(kept.since / _SECOND))
+        length = f"{(kept.until - kept.since) / _SECOND:.0f} s"
+        rows.append((module, since, length, str(len(kept.files)), size(kept.size)))
+    kept = parts[0][1]
+    about = f"{kept.id}: {kept.why}" + (f" (asked by {kept.asked_by})" if kept.asked_by else "")
+    options.show([kept for _, kept in parts], about, Table("MODULE, SINCE (UTC), >LENGTH, >FILES, >SIZE", rows))
+    return 0
+
+
+@agent_verb(
+    argument("why", required=False, default="by hand"),
+    option("--seconds", help="How much of the past. [default: all that is there]", type=FiniteRange(0.1)),
+    output_option("Fetch and merge it, too."),
+)
+def record_keep(why: str, seconds: float | None, output: Path | None, options: Options) -> int:
+    """Keep what all modules have of the last minutes; WHY names it.
+
+    Modules that are not linked keep it when they are back. Exits 1 if a module cannot.
+
+    ---
+
+    Examples:
+      rmpa record keep
+      rmpa record keep "the arm hit the table" --seconds 60 -o hit.mcap
+    """
+    if output is not None:
+        writable(output)
+    with options.client(CALL) as client:
+        name, answers = keep(client, why, seconds)
+        rows = [(module, problem or "kept") for module, problem in answers.items()]
+        about: dict[str, Any] = {"id": name, "modules": answers}
+        lines: list[str] = []
+        if output is not None and name:
+            with parts_folder(output) as folder:
+                fetched = fetch(client, name, folder)
+                result = join([folder], output)
+            about |= {"file": str(output), "messages": result.count}
+            lines = [*merged(output, result), *(f"! {one.module}: {one.problem}" for one in fetched if one.problem)]
+            answers |= {one.module: one.problem for one in fetched if one.problem}
+    options.show(about, name, Table("MODULE, STATE", rows), *lines)
+    return int(not name or any(answers.values()))
+
+
+@agent_verb(argument("recording", _names), output_option("Where to. [default: ./RECORDING]", "DIR"))
+def record_fetch(recording: str, output: Path | None, options: Options) -> int:
+    """Fetch a RECORDING from all modules that have it, a folder each; what is there already is not fetched again.
+
+    A module whose link is lost meanwhile is waited for, a minute long. The same command goes on where one was ended.
+    Commands do not wait for it: it takes half of the way at the most.
+
+    ---
+
+    Examples:
+      rmpa record fetch 20261129-121500-arm-alarm
+      rmpa record fetch 20261129-121500-arm-alarm -o fall
+    """
+    folder = output or Path(recording)
     try:
-        with options.client(CALL) as client, parts_folder(output) as folder:
-            name, answers = keep(client, f"by hand for {seconds:.0f} s", seconds, given["peers"])
-            ends = {each.module: each for each in all_recordings(client) if each.module in recorders}
-            problems |= _missing(recorders, ends, answers, seconds)
-            if not name:
-                text = "; ".join(f"{module}: {problem}" for module, problem in problems.items())
-                raise RmpaError(f"no module has kept it: {text}", code="recording-stopped")
-            fetched = fetch(client, name, folder, recorders)
-            problems |= {one.module: one.problem for one in fetched if one.problem}
-            result = join([folder], output, "", given["globs"])
-            if not any(one.problem for one in fetched):
-                for one in fetched:
-                    client.call("record", object, what="remove", module=one.module, id=name)
-                name = ""
-    finally:
-        if name:
-            click.echo(f"the modules have it as {name}: rmpa record fetch {name}", err=True)
-    left = {one: count for one in ends if (count := _grown({one: recorders[one]}, ends, "left_out", given["globs"]))}
-    about = {"file": str(output), "messages": result.count, "modules": list(result.offsets)}
-    options.show(
-        {**about, "problems": problems, "left_out": left},
-        *merged(output, result),
-        *(f"! {module}: {problem}" for module, problem in problems.items()),
-        *(
-            f"= {module}: {count:,} messages above its [record] topic_rate, total_rate or thin"
-            for module, count in left.items()
-        ),
-    )
-    return int(bool(problems) or not result.count)
+        with options.client(CALL) as client:
+            fetched = fetch(client, recording, folder)
+    except KeyboardInterrupt:
+        click.echo(f"\nnot all is in {folder}: the same command goes on from there", err=True)
+        raise
+    problems = {one.module: one.problem for one in fetched if one.problem}
+    about = {"folder": str(folder), "modules": {one.module: one.size for one in fetched}, "problems": problems}
+    table = Table("MODULE, >SIZE, PROBLEM", [(one.module, size(one.size), one.problem or "-") for one in fetched])
+    after = "not all is there: the same command goes on from there"
+    options.show(about, table, after if problems else f"merge it: rmpa record merge {folder} -o {recording}.mcap")
+    return int(bool(problems))
 
 
-def _recorders(
-    found: Iterable[ModuleRecordings], wanted: Sequence[str]
-) -> tuple[dict[str, ModuleRecordings], dict[str, str]]:
-    """The modules that record, and by module why others do not.
+@json_verb(
+    argument("recordings", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path)),
+    output_option(".mcap or .bag.", required=True),
+    option("--clock reference", "MODULE", "Whose clock. [default: the best known]", default=""),
+)
+def record_merge(recordings: tuple[Path, ...], output: Path, reference: str, options: Options) -> int:
+    """Put RECORDINGS of several modules on one timeline: files, or folders as `rmpa record fetch` makes them.
 
-    Raises:
-        RmpaError: None does.
+    ---
+
+    Examples:
+      rmpa record merge fall -o fall.mcap
+      rmpa record merge arm.mcap base.mcap --clock base -o both.bag
     """
-    all_of = {each.module: each for each in found if not wanted or each.module in wanted}
-    problems = {name: "it is not linked; `rmpa peer list` shows why" for name in wanted if name not in all_of}
-    for name, each in all_of.items():
-        if each.problem or not each.status:
-            problems[name] = each.problem or NO_RECORDER
-    recorders = {name: each for name, each in all_of.items() if name not in problems}
-    if not recorders:
-        text = "; ".join(f"{name}: {problem}" for name, problem in problems.items())
-        raise RmpaError(f"no module records: {text}", code="no-recorder")
-    return recorders, problems
+    check_record("rmpa record")
+    result = join([*recordings], output, reference)
+    about = {
+        "file": str(output),
+        "reference": result.reference,
+        "offsets": {name: one._asdict() for name, one in result.offsets.items()},
+        "messages": result.count,
+        "doubles": result.doubles,
+        "damaged": list(result.damaged.values()),
+        "notes": result.notes,
+    }
+    rows = []
+    for name, one in result.offsets.items():
+        ahead = "the clock" if name == result.reference else f"{1e3 * one.ahead:+.3f} ms"
+        rows.append((name, ahead, "not known" if one.error is None else f"{1e3 * one.error:.3f} ms"))
+    options.show(about, *merged(output, result), Table("MODULE, >AHEAD, >±", rows))
+    return int(bool(result.damaged))
 
 
-def _bounds(recorders: dict[str, ModuleRecordings], duration: float | None) -> float:
-    """For how long to record.
+@agent_verb(argument("recording", _names), option("--module", help="Only that of this module.", default=""))
+def record_rm(recording: str, module: str, options: Options) -> int:
+    """Remove a RECORDING at all modules that have it.
 
-    Raises:
-        ConfigError: A ring is too short for that.
+    ---
+
+    Examples:
+      rmpa record rm 20261129-121500-arm-alarm
     """
-    least, shortest = float("inf"), ""
-    for name, each in recorders.items():
-        most, seconds = each.status.get("bounds", (0, None))
-        total, back = each.status.get("ring", (0, 0.0))
-        by_size = most * back / total if total and back > _SURE else float("inf")
-        if (holds := min(seconds or float("inf"), by_size)) < least:
-            least, shortest = holds, name
-    if duration is not None and duration > least:
-        text = f"{duration:g} s are asked for, and the ring of {shortest} holds the last {least:.0f} s"
-        raise ConfigError(
-            "--duration", text, "set [record] seconds or megabytes there, or record with -o at the module"
-        )
-    return duration or min(least, 86_400.0)
-
-
-def _wait(options: Options, recorders: dict[str, ModuleRecordings], seconds: float, given: dict[str, Any]) -> None:
-    """Wait for the end, with progress; Ctrl-C raises ``KeyboardInterrupt``."""
-    began, counts = time.monotonic(), (0, 0)
-    looked = began
     with options.client(CALL) as client:
-        while (rest := began + seconds - time.monotonic()) > 0:
-            time.sleep(min(rest, PROGRESS))
-            if time.monotonic() - looked > _LOOK and (sys.stderr.isatty() or given["megabytes"]):
-                now = {each.module: each for each in all_recordings(client)}
-                counts = (
-                    _grown(recorders, now, "messages", given["globs"]),
-                    _grown(recorders, now, "size", given["globs"]),
-                )
-                looked = time.monotonic()
-            took = time.monotonic() - began
-            say(f"{took:6.1f} s  {len(recorders)} modules  {counts[0]:,} messages  {size(counts[1])}")
-            if given["megabytes"] and counts[1] >= given["megabytes"] * MB:
-                return
-
-
-def _grown(
-    before: dict[str, ModuleRecordings], now: dict[str, ModuleRecordings], what: str, globs: Sequence[str]
-) -> int:
-    """By how much the recorders' counts of topics have grown."""
-    total = 0
-    for name, each in before.items():
-        then = each.status.get(what, {})
-        for topic, count in (now[name].status.get(what, {}) if name in now else {}).items():
-            if not globs or matches_any(globs, topic):
-                total += max(0, count - then.get(topic, 0))
-    return total
-
-
-def _missing(
-    before: dict[str, ModuleRecordings], now: dict[str, ModuleRecordings], answers: dict[str, str], seconds: float
-) -> dict[str, str]:
-    """By module what of the time cannot be had, and why."""
-    problems = {}
-    for name in before:
-        status = now[name].status if name in now else {}
-        (most, _), (total, back) = status.get("bounds", (0, None)), status.get("ring", (0, seconds))
-        if name not in answers:
-            problems[name] = "it is not linked any more"
-        elif answers[name]:
-            problems[name] = answers[name]
-        elif total > _FULL * most > 0 and back < seconds:
-            problems[name] = f"the first {seconds - back:.0f} s are missing: its ring is full ([record] megabytes)"
-    return problems
+        removed, problems = remove_recording(client, recording, module)
+    if not removed and not problems:
+        raise RmpaError(f"no module has a recording {recording}; `rmpa record list` shows them", code="unknown-name")
+    rows = [*((name, "removed") for name in removed), *problems.items()]
+    options.show({"removed": removed, "problems": problems}, Table("MODULE, STATE", rows))
+    return int(bool(problems))

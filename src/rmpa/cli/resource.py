@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from rmpa.bridge.launched import ModuleResources
-from rmpa.cli.completion import graph_of, of_peer
-from rmpa.cli.graph import GraphName, read_graph, read_name, run_stream, suggestion, with_node
-from rmpa.cli.options import Options, argument, count_option, flag, graph_verb
+from rmpa.cli.graph import GraphName, read_name, run_stream, suggestion
+from rmpa.cli.options import Options, argument, count_option, flag, graph_of, graph_verb, of_peer
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.identity import OUTSIDE_GUID, proxied_node, proxied_peer
-from rmpa.observe.control_client import ControlClient
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE, TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
@@ -164,7 +162,7 @@ def run_with_resources(options: Options, body: Callable[[ResourceGraph], Awaitab
 
 async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[_T]]) -> _T:
     """What ``body`` returns, run with all resources of a master's graph."""
-    graph = await read_graph(master)
+    graph = await master.graph()
     snapshot = await asyncio.to_thread(master.snapshot, topics=())
     peers = snapshot.peers if snapshot is not None else ()
     sites = {peer.name for peer in peers if peer.guid == OUTSIDE_GUID} - {ROS2}  # other sites that a gateway joins
@@ -172,7 +170,7 @@ async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitab
     async def within(node: Node) -> _T:
         return await body(ResourceGraph(node, graph, await find_resources(node, graph, sites)))
 
-    return await with_node(master, "rmpa_resource", within)
+    return await master.with_node("rmpa_resource", within)
 
 
 async def find_resources(node: Node, graph: Graph, sites: Iterable[str] = ()) -> tuple[SeenResource, ...]:
@@ -232,7 +230,7 @@ async def _first_messages(node: Node, wanted: Iterable[tuple[str, str]], kind: s
 
 
 def resource_names(ctx: click.Context, _: str) -> Iterable[str]:
-    """Resources of the graph, for ``completion.completes``."""
+    """Resources of the graph, for ``options.completes``."""
     ending = f"/{TOPIC}"
     for topic, nodes in graph_of(ctx).publishers.items():
         if topic.endswith(ending):
@@ -273,36 +271,36 @@ def resource_list(options: Options) -> None:
                 text = "a request to that name reaches all of them; docs/guides/names.md shows how to separate them"
                 warn(f"{count} modules have a resource {path}: {text}", "same-names")
         states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
-        found: list[dict[str, Any]] = []
-        rows = []
+        found: list[tuple[dict[str, Any], LaunchedResource | None]] = []
         for one in graph.seen:
             said = one.descriptor
             about = {"name": one.path, "peer": one.peer, "role": said.role, "physical": said.physical}
             about |= {"description": said.description, "state": states.get(one)}
-            its = launched.pop((one.peer, one.path), None)
-            found.append(about | {"profile": profiles.get(one), "context": contexts.get(one)} | _started(its))
-            kind = "device" if said.physical else "simulated"
-            ends = [profiles.get(one) or "-", contexts.get(one) or "-", _processes(its), said.description]
-            rows.append([str(one), states.get(one) or "does not answer", said.role, kind, *ends])
+            about |= {"profile": profiles.get(one), "context": contexts.get(one)}
+            found.append((about, launched.pop((one.peer, one.path), None)))
         for (peer, path), its in launched.items():
             empty = dict.fromkeys(("role", "physical", "profile", "context"))
-            about = {"name": path, "peer": peer, **empty, "description": its.why, "state": its.state}
-            found.append(about | _started(its))
-            rows.append([str(GraphName(path, peer)), its.state, "-", "-", "-", "-", _processes(its), its.why])
-        colours = [_COLOURS.get(each["state"], "") for each in found]
+            found.append(({"name": path, "peer": peer, **empty, "description": its.why, "state": its.state}, its))
+        rows = [_row(*each) for each in found]
+        colours = [_COLOURS.get(about["state"], "") for about, _ in found]
         titles = "RESOURCE, STATE, ROLE, KIND, PROFILE, CONTEXT, PROCESSES, DESCRIPTION"
         if not any(row[6] for row in rows):
             titles, rows = titles.replace("PROCESSES, ", ""), [[*row[:6], row[7]] for row in rows]
-        options.show(found, Table(titles, rows, colours))
+        options.show([about | _started(its) for about, its in found], Table(titles, rows, colours))
 
     asyncio.run(with_resources(master, body))
 
 
+def _row(about: dict[str, Any], its: LaunchedResource | None) -> list[str]:
+    kind = {None: "-", True: "device", False: "simulated"}[about["physical"]]
+    ends = [about["profile"] or "-", about["context"] or "-", _processes(its), about["description"]]
+    state = about["state"] or "does not answer"
+    return [str(GraphName(about["name"], about["peer"])), state, about["role"] or "-", kind, *ends]
+
+
 def _launched(master: Master) -> dict[tuple[str | None, str], LaunchedResource]:
     """What agents can start, by peer and by the name of the resource's node; nothing where they do not tell."""
-    if master.agent is None:
-        return {}
-    with contextlib.suppress(RmpaError), ControlClient(master.agent) as client:
+    with contextlib.suppress(RmpaError), master.client() as client:
         told = client.call("launch", tuple[ModuleResources, ...], what="list")
         own = told[0].module if told else ""
         return {
@@ -338,7 +336,7 @@ def status_of(status: Any) -> dict[str, Any]:
     }
 
 
-@graph_verb(flag("-a", "--all", "everything", help="Also those without a problem."))
+@graph_verb(flag("-a --all everything", "Also those without a problem."))
 def alarm_list(everything: bool, options: Options) -> None:
     """List the resources that have a problem, here and at peers.
 
@@ -409,7 +407,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
         warned = False
         while not enough.done():
             with contextlib.suppress(RmpaError):
-                graph = await read_graph(master)
+                graph = await master.graph()
                 for topic in graph.publishers.keys() - known:
                     path = topic.removesuffix("/alarms")
                     found = path != topic and graph.types.get(topic) == ARRAY_TYPE
@@ -425,7 +423,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
                 warn("there is no resource yet; waiting", "unknown-name")
             await asyncio.wait((enough,), timeout=_LOOK)
 
-    await with_node(master, "rmpa_alarm", look)
+    await master.with_node("rmpa_alarm", look)
 
 
 def _print_alarm(path: str, received: Received, alarm: dict[str, Any], *, as_json: bool) -> None:
@@ -439,15 +437,3 @@ def _print_alarm(path: str, received: Received, alarm: dict[str, Any], *, as_jso
     for key, value in alarm["values"].items():
         if value.startswith("wanted "):
             print_text(f"    {key}: {value}")
-
-
-def known_name(what: str, text: str, known: Iterable[str]) -> None:
-    """Check that a resource has a profile or context of that name.
-
-    Raises:
-        ConfigError: It has none.
-    """
-    names = list(known)
-    if text not in names:
-        remedy = suggestion(text, names, f"there are {printable(', '.join(names)) or 'none'}")
-        raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)

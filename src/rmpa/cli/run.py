@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 import click
 
 from rmpa.cli.main import verb
-from rmpa.cli.options import argument, flag
+from rmpa.cli.options import argument, flag, option
 from rmpa.cli.output import print_error, printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.runtime import limits
@@ -59,28 +59,16 @@ _ROS_MODULES: Final = {
 
 @verb(
     argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path)),
-    click.option(
-        "--name", metavar="NAME", help="The module's name. [default: as rmpa up, else the first resource's]"
-    ),
-    click.option("--master", metavar="URI", help="Run on this ROS core; no agent is started."),
-    click.option(
-        "--set",
-        "given",
-        metavar="[RESOURCE.]PARAMETER=VALUE",
-        multiple=True,
-        help="Start with this value; repeatable.",
-    ),
-    click.option(
-        "--state",
-        metavar="DIR",
-        help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
-    ),
-    flag("--no-state", help="The resources store nothing; for an empty core add -- --keep never."),
-    click.option(
+    option("--name", "NAME", "The module's name. [default: as rmpa up, else the first resource's]"),
+    option("--master", "URI", "Run on this ROS core; no agent is started."),
+    option("--set given", "[RESOURCE.]PARAMETER=VALUE", "Start with this value; repeatable.", multiple=True),
+    option("--state", "DIR", "Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]"),
+    flag("--no-state", "The resources store nothing; for an empty core add -- --keep never."),
+    option(
         "--log-level",
+        help="Of the resources; that of the agent comes after --. [default: info]",
         default="info",
         type=click.Choice(["debug", "info", "warning", "error"]),
-        help="Of the resources; that of the agent comes after --. [default: info]",
     ),
     argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]"),
     context_settings={"ignore_unknown_options": False},

@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.completion import services
-from rmpa.cli.graph import marked, origin_json, origin_text, peers_of, read_graph, read_name, require_peer
-from rmpa.cli.options import FiniteRange, Options, Selection, argument, flag, graph_verb, selection_options, summary
-from rmpa.cli.output import Table, duration, print_json, printable, warn
-from rmpa.cli.values import fill_stamps, read_values, to_text
+from rmpa.cli.graph import CALLER_ID, marked, origin_json, origin_text, peers_of, read_name
+from rmpa.cli.options import (
+    FiniteRange,
+    Options,
+    Selection,
+    argument,
+    by_module,
+    flag,
+    graph_verb,
+    option,
+    selection_options,
+    services,
+)
+from rmpa.cli.output import Table, duration, fill_stamps, print_json, printable, read_values, to_text, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
@@ -29,7 +38,6 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 
-_CALLER_ID: Final = "/rmpa_service"
 # Servers that are asked at the same time.
 _AT_ONCE: Final = 16
 # Seconds between two questions to the master whether the service is there.
@@ -69,7 +77,7 @@ async def _lookup(master: Master, name: str) -> str:
         RmpaError: It knows no such service.
     """
     try:
-        reply = await call_api(master.uri, "lookupService", _CALLER_ID, name)
+        reply = await call_api(master.uri, "lookupService", CALLER_ID, name)
     except UnreachableError:
         raise master.unreachable() from None
     if reply.code != 1:
@@ -91,7 +99,7 @@ def probe(master: Master, names: Iterable[str]) -> dict[str, Probed]:
         async with turns:
             try:
                 uri = await _lookup(master, name)
-                found = await ServiceConnection.probe(uri, name, _CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)
+                found = await ServiceConnection.probe(uri, name, CALLER_ID, limits.SERVICE_OPEN_TIMEOUT)
                 return Probed(uri, found.description)
             except RmpaError as error:
                 return Probed(uri, None, str(error))
@@ -110,29 +118,19 @@ def _of_agent(master: Master, services: tuple[str, ...] | bool) -> Sequence[Serv
     return snapshot.services if snapshot is not None else ()
 
 
-def _transport_text(info: ServiceInfo | None) -> str:
-    """The transport of a peer's service in a few words; empty for others."""
-    if info is None or info.transport == "direct":
-        return "direct" if info is not None else ""
-    return f"relayed ({info.condition})" if info.condition and info.wanted != "relay" else "relayed"
-
-
 def _crossing(infos: Sequence[ServiceInfo]) -> Iterator[str]:
     """Whether a service may cross, each peer that offers it, and how its calls went."""
     for info in infos:
-        yield f" * {_headline(info)}"
+        over_there = f", {info.wire} there" if info.wire else ""
+        state = f"not here: {info.hidden}" if info.hidden else info.state
+        headline = f"from {info.peer}: {info.node}{over_there}, {state}"
+        if info.direction == "out":
+            who = f", open at {', '.join(info.callers)}" if info.callers else ""
+            headline = f"{'may cross' if info.crosses else 'does not cross'}: {info.policy}{who}"
+        yield f" * {headline}"
         yield from (f"     {label:<10} {text}" for label, text in _facts(info))
         if info.problem:
             warn(f"{info.peer or info.node}: {info.problem}", "service-failed")
-
-
-def _headline(info: ServiceInfo) -> str:
-    if info.direction == "out":
-        who = f", open at {', '.join(info.callers)}" if info.callers else ""
-        return f"{'may cross' if info.crosses else 'does not cross'}: {info.policy}{who}"
-    over_there = f", {info.wire} there" if info.wire else ""
-    state = f"not here: {info.hidden}" if info.hidden else info.state
-    return f"from {info.peer}: {info.node}{over_there}, {state}"
 
 
 def _facts(info: ServiceInfo) -> Iterator[tuple[str, str]]:
@@ -163,7 +161,7 @@ def _json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, obj
 
 @graph_verb(
     argument("namespace", services, default=""),
-    flag("-v", "--verbose", help="Types and nodes too; each server is asked."),
+    flag("-v --verbose", "Types and nodes too; each server is asked."),
     selection_options,
 )
 def service_list(namespace: str, verbose: bool, selection: Selection, options: Options) -> None:
@@ -179,33 +177,32 @@ def service_list(namespace: str, verbose: bool, selection: Selection, options: O
       rmpa service list base:/
     """
     wanted = read_name(namespace or "/", "service")
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
+    master, graph = options.graph(wanted)
     peers = {name: peers_of(nodes) for name, nodes in sorted(graph.services.items())}
     every = [name for name, of in peers.items() if wanted.contains(name, of) and selection.wants(name, of)]
-    shown = every
-    if not options.as_json and selection.is_long(every):
-        shown = sorted(every, key=lambda name: (bool(peers[name]), name))[: selection.lines]
+    shown = selection.first(every, lambda name: (bool(peers[name]), name))
     found = probe(master, shown) if verbose else {}
     mesh = {}
     if verbose or options.as_json:
         mesh = {info.name: info for info in _of_agent(master, services=True) if info.transport}
 
     def text() -> Iterator[Text]:
-        if shown is not every:
-            yield summary(len(every), "services", ("remote" if peers[n] else "of this module" for n in every))
-            yield ""
+        about = by_module("services", [bool(peers[name]) for name in every])
+        lines: Text = marked(shown, graph.services)
         if verbose:
             titles = "SERVICE, TYPE, NODE, TRANSPORT" if mesh else "SERVICE, TYPE, NODE"
-            yield Table(titles, [row(name)[: titles.count(",") + 1] for name in shown])
-        else:
-            yield from marked(shown, graph.services)
-        yield selection.rest(every, "services", "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'")
+            lines = Table(titles, [row(name)[: titles.count(",") + 1] for name in shown])
+        filters = "rmpa service list MODULE:/, /NAMESPACE, --match '*/start'"
+        yield selection.framed(every, "services", about, filters, lines)
 
     def row(name: str) -> list[str]:
         said, node = found[name].description, graph.server(name)
         kind = said.type if said is not None else "does not answer"
-        return [name, kind, origin_text(node or "unknown"), _transport_text(mesh.get(name))]
+        transport = ""
+        if (info := mesh.get(name)) is not None:
+            why = f" ({info.condition})" if info.condition and info.wanted != "relay" else ""
+            transport = "direct" if info.transport == "direct" else f"relayed{why}"
+        return [name, kind, origin_text(node or "unknown"), transport]
 
     def value(name: str) -> dict[str, object]:
         about, info = _json(graph, name, found.get(name)), mesh.get(name)
@@ -223,7 +220,7 @@ def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     wanted = read_name(text, "service")
     master, graph = options.graph()
     if wanted.name not in graph.services:
-        require_peer(master, graph, wanted)
+        master.require_peer(graph, wanted)
     return wanted, master, graph
 
 
@@ -315,10 +312,8 @@ def service_find(kind: str, options: Options) -> None:
 @graph_verb(
     argument("service", services),
     argument("values", nargs=-1),
-    flag("-w", "--wait", help="Wait until the service exists, at most --timeout."),
-    click.option(
-        "-t", "--timeout", type=FiniteRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
-    ),
+    flag("-w --wait", "Wait until the service exists, at most --timeout."),
+    option("-t --timeout", help="Seconds for the answer.", type=FiniteRange(0.001), default=60.0, show_default=True),
     context_settings={"ignore_unknown_options": True},
 )
 def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: Options) -> None:
@@ -346,11 +341,11 @@ def service_call(service: str, values: tuple[str, ...], wait: bool, timeout: flo
     async def ask() -> None:
         if wait:
             await _wait(master, wanted, timeout)
-        graph = await read_graph(master)
-        require_peer(master, graph, wanted)
+        graph = await master.graph()
+        master.require_peer(graph, wanted)
         graph.require_service(wanted)
         uri = await _lookup(master, wanted.name)
-        connection = await ServiceConnection.open(uri, wanted.name, _CALLER_ID, timeout=timeout)
+        connection = await ServiceConnection.open(uri, wanted.name, CALLER_ID, timeout=timeout)
         try:
             kind = find_service_type(connection.description.type, connection.description.md5sum)
             request = kind.request.serialize(fill_stamps(plain, time.time_ns()))
@@ -381,7 +376,7 @@ async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # n
         async with asyncio.timeout(timeout):
             while True:
                 try:
-                    (await read_graph(master)).require_service(wanted)
+                    (await master.graph()).require_service(wanted)
                 except RmpaError as error:
                     last = error
                 else:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
-from abc import ABC, abstractmethod
 from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.completion import topics
 from rmpa.cli.graph import (
     Enough,
     marked,
@@ -19,13 +19,22 @@ from rmpa.cli.graph import (
     peers_mark,
     peers_of,
     read_name,
-    require_peer,
     run_stream,
     shown_state,
-    warn_unpublished,
-    watch_topic,
+    unknown_name,
 )
-from rmpa.cli.options import Options, Selection, argument, count_option, flag, graph_verb, selection_options, summary
+from rmpa.cli.options import (
+    Options,
+    Selection,
+    argument,
+    by_module,
+    count_option,
+    flag,
+    graph_verb,
+    option,
+    selection_options,
+    topics,
+)
 from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
@@ -34,11 +43,11 @@ from rmpa.observe.why.diagnosis import UNMEASURED, route_texts, subscriber_text
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.cli.graph import Graph, GraphName, Master
     from rmpa.cli.output import Text
-    from rmpa.core.facts import LatencyInfo, RouteInfo, SubscriberTransport, TopicInfo
+    from rmpa.core.facts import RouteInfo, SubscriberTransport, TopicInfo
     from rmpa.ros.node.node import Received
 
 
@@ -58,9 +67,9 @@ def _rate_text(route: RouteInfo) -> str:
     )
 
 
-def _latency_text(latency: LatencyInfo | None) -> str:
+def _delay_text(route: RouteInfo) -> str:
     """One-way latency, with the bound of its error."""
-    if latency is None:
+    if (latency := route.latency) is None:
         return "unknown yet"
     return (
         f"p50 {duration(latency.p50)}, p99 {duration(latency.p99)}, max {duration(latency.max)}, "
@@ -111,7 +120,7 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield "lane", route.lane
     if route.direction == "in" and route.messages:
         yield "rate", _rate_text(route)
-        yield "latency", _latency_text(route.latency)
+        yield "latency", _delay_text(route)
         yield "bandwidth", _bandwidth_text(route)
     if route.messages or route.lost or route.events.get("loss_unknown"):
         yield "missing", _losses_text(route)
@@ -149,9 +158,9 @@ def _json(graph: Graph, name: str) -> dict[str, object]:
 
 @graph_verb(
     argument("namespace", topics, default=""),
-    flag("-v", "--verbose", help="Types and counts, publishers and subscribers apart."),
-    flag("-p", "--publishers", help="Only topics that have a publisher."),
-    flag("-s", "--subscribers", help="Only topics that have a subscriber."),
+    flag("-v --verbose", "Types and counts, publishers and subscribers apart."),
+    flag("-p --publishers", "Only topics that have a publisher."),
+    flag("-s --subscribers", "Only topics that have a subscriber."),
     selection_options,
 )
 def topic_list(
@@ -170,8 +179,7 @@ def topic_list(
       rmpa topic list joystick:/
     """
     wanted = read_name(namespace or "/")
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
+    _, graph = options.graph(wanted)
     peers = {name: peers_of(graph.publishers.get(name, ())) for name in graph.topics}
     names = [
         name
@@ -183,28 +191,24 @@ def topic_list(
     ]
 
     def text() -> Iterator[Text]:
-        shown = names
-        if selection.is_long(names):
-            remote = {name for name in names if peers[name] and all(map(proxied_peer, graph.publishers[name]))}
-            owners = {peer for name in remote for peer in peers[name]}
-            yield summary(len(names), "topics", ("remote" if n in remote else "of this module" for n in names))
-            yield f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}"
-            yield ""
-            shown = sorted(names, key=lambda name: (name in remote, name))[: selection.lines]
+        remote = {name for name in names if peers[name] and all(map(proxied_peer, graph.publishers[name]))}
+        owners = {peer for name in remote for peer in peers[name]}
+        whose = f"the remote ones are of {len(owners):,} module{'s' if len(owners) != 1 else ''}"
+        about = (by_module("topics", [name in remote for name in names]), whose)
+        shown = selection.first(names, lambda name: (name in remote, name))
+        lines: Text = marked(shown, graph.publishers)
         if verbose:
-            if not subscribers:
-                yield from _verbose("Published topics", "publisher", graph, graph.publishers, shown)
-            if not publishers:
-                yield from _verbose("Subscribed topics", "subscriber", graph, graph.subscribers, shown)
-        else:
-            yield from marked(shown, graph.publishers)
-        yield selection.rest(names, "topics", "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'")
+            published = () if subscribers else _verbose("Published", "publisher", graph, graph.publishers, shown)
+            subscribed = () if publishers else _verbose("Subscribed", "subscriber", graph, graph.subscribers, shown)
+            lines = (published, subscribed)
+        filters = "rmpa topic list MODULE:/, /NAMESPACE, --match '*/scan', --peer 'arm*'"
+        yield selection.framed(names, "topics", about, filters, lines)
 
     options.show([_json(graph, name) for name in names] if options.as_json else None, text())
 
 
-def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], names: list[str]) -> Iterator[str]:
-    yield f"{title}:"
+def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], names: Sequence[str]) -> Iterator[str]:
+    yield f"{title} topics:"
     for name in names:
         if name in ends:
             kind, count = printable(graph.types.get(name, "unknown type")), len(ends[name])
@@ -215,9 +219,9 @@ def _verbose(title: str, what: str, graph: Graph, ends: dict[str, list[str]], na
 def _find(text: str, options: Options) -> tuple[GraphName, Master, Graph]:
     """The topic that a user names, the master, and its graph, which has the topic."""
     wanted = read_name(text)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
-    graph.require_topic(wanted.name)
+    master, graph = options.graph(wanted)
+    if wanted.name not in graph.publishers and wanted.name not in graph.subscribers:
+        raise unknown_name("topic", wanted.name, graph.topics)
     return wanted, master, graph
 
 
@@ -313,181 +317,156 @@ def topic_find(kind: str, options: Options) -> None:
     options.show(found, marked(found, graph.publishers))
 
 
-class _Figures(ABC):
-    """Figures over a sliding window of messages, measured by this command's own subscriber.
+@dataclass(slots=True)
+class _Window:
+    """The last messages that this command's own subscriber got: seconds between them, bytes, and ages in seconds.
+
+    Args:
+        size: Messages in it.
+        messages: All that came.
+        last: When the last one came, monotonic seconds.
+    """
+
+    size: int
+    messages: int = 0
+    last: float | None = None
+    periods: deque[float] = field(init=False)
+    sizes: deque[int] = field(init=False)
+    delays: deque[float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.periods, self.sizes, self.delays = (deque(maxlen=self.size) for _ in range(3))
+
+    def add(self, received: Received, now: float) -> None:
+        """One message, at ``now`` (monotonic seconds)."""
+        if self.last is not None:
+            self.periods.append(now - self.last)
+        self.last = now
+        self.sizes.append(len(received.raw))
+        self.messages += 1
+
+    def add_delay(self, received: Received, *, by_link: bool) -> None:
+        """The age of a message, by its header's stamp: exact only as far as both machines' clocks agree.
+
+        Args:
+            received: The message.
+            by_link: Whether there is an agent, which knows the age of what came over a link, by that link's clock.
+
+        Raises:
+            RmpaError: It has no header, and did not come over a link.
+        """
+        if any(each.name == "header" and each.type == "std_msgs/Header" for each in received.kind.fields):
+            stamp = received.message.header.stamp
+            self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
+        elif not by_link or proxied_peer(received.caller_id) is None:
+            problem = f"{received.kind.name} has no header, so it has no stamp to measure its age by"
+            raise RmpaError(problem, code="invalid-value")
+
+
+def _rate(seen: _Window, _: Sequence[RouteInfo]) -> tuple[dict[str, object], str]:
+    """Messages a second, for JSON in Hz and seconds, and in the format of ``rostopic hz``."""
+    p = SampleSpread.of(seen.periods)
+    rate = 1 / p.mean if p.mean > 0 else math.nan
+    values = {"rate": rate, "min": p.min, "max": p.max, "sd": p.sd, "window": p.count + 1}
+    spread = f"min: {p.min:.3f}s max: {p.max:.3f}s std dev: {p.sd:.5f}s window: {p.count + 1}"
+    text = f"average rate: {rate:.3f}\n\t{spread}" if p.count else "one message, no rate yet"
+    return {"source": "subscriber", **values}, text
+
+
+def _bandwidth(seen: _Window, _: Sequence[RouteInfo]) -> tuple[dict[str, object], str]:
+    """Bytes a second, for JSON and in the format of ``rostopic bw``."""
+    s, elapsed = SampleSpread.of(seen.sizes), math.fsum(seen.periods)
+    first = seen.sizes[0] if len(seen.sizes) > len(seen.periods) else 0  # came before the first period
+    rate = (sum(seen.sizes) - first) / elapsed if elapsed > 0 else math.nan
+    values = {"bandwidth": rate, "mean": s.mean, "min": s.min, "max": s.max, "window": s.count}
+    spread = f"mean: {size(s.mean)} min: {size(s.min)} max: {size(s.max)} window: {s.count}"
+    return {"source": "subscriber", **values}, f"average: {size(rate)}/s\n\t{spread}"
+
+
+def _delay(seen: _Window, routes: Sequence[RouteInfo]) -> tuple[dict[str, object], str]:
+    """Ages in seconds; for JSON without headers those of the agent, if there is one remote source.
+
+    The agent knows the clocks' offset. The text is as ``rostopic delay`` has it, with a digit more.
+    """
+    s = SampleSpread.of(seen.delays)
+    error: float | None = None
+    text = "no header, so no stamp to measure the whole age by"
+    if seen.delays:
+        spread = f"min: {s.min:.4f}s max: {s.max:.4f}s std dev: {s.sd:.5f}s window: {s.count}"
+        text = f"average delay: {s.mean:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"
+    elif len(routes) == 1 and (latency := routes[0].latency) is not None:
+        s, error = latency, latency.error
+    values = {"delay": s.mean, "min": s.min, "max": s.max, "sd": s.sd, "window": s.count}
+    return {"source": "header" if seen.delays else "link", "error": error, **values}, text
+
+
+def _arriving(master: Master, wanted: GraphName) -> tuple[RouteInfo, ...]:
+    """The routes of a topic's remote sources from which a message has come."""
+    info = ask_agent(master, wanted.name)
+    routes = (route for route in (info.routes if info else ()) if route.direction == "in" and route.messages)
+    return tuple(route for route in routes if wanted.peer in (None, route.peer))
+
+
+def _watch(
+    measure: Callable[[_Window, Sequence[RouteInfo]], tuple[dict[str, object], str]],
+    remote: Callable[[RouteInfo], str],
+    topic: str,
+    window: int,
+    count: int | None,
+    options: Options,
+    *,
+    delays: bool = False,
+) -> None:
+    """Print figures over a sliding window of messages once a second, if a message came; first a heading.
 
     For each remote source the agent's figures follow, which are more exact: the agent takes the time of each message
     when it arrives, this program only when it is scheduled.
 
     Args:
-        master: The master.
-        wanted: The topic.
-        window: Messages in it.
+        measure: The figures for JSON, and as text.
+        remote: The agent's figures of a remote source as text.
+        topic: The topic, as the user names it.
+        window: Messages in the window.
+        count: Messages after which it ends.
+        options: Of the command.
+        delays: Whether the ages of messages are measured.
     """
-
-    of_agent = "at the agent"
-    source = "subscriber"
-
-    def __init__(self, master: Master, wanted: GraphName, window: int) -> None:
-        self.master, self.wanted = master, wanted
-        self.messages = 0
-        self._shown: int | None = None
-        self._last: float | None = None
-        self.periods: deque[float] = deque(maxlen=window)
-        self.sizes: deque[int] = deque(maxlen=window)
-        self.delays: deque[float] = deque(maxlen=window)
-
-    def add(self, received: Received, now: float) -> None:
-        """One message, at ``now`` (monotonic seconds)."""
-        if self._last is not None:
-            self.periods.append(now - self._last)
-        self._last = now
-        self.sizes.append(len(received.raw))
-        self.messages += 1
-
-    async def show(self, *, as_json: bool) -> None:
-        """Print a line of figures if a message came since the last one; the first call prints a heading."""
-        import asyncio
-
-        shown, self._shown = self._shown, self.messages
-        if shown == self.messages or shown is None:
-            if not as_json:
-                print_text("no new messages" if shown is not None else f"subscribed to [{self.wanted}]")
-            return
-        routes = await asyncio.to_thread(self._arriving)
-        if as_json:
-            print_json({"topic": str(self.wanted), **self.values(routes), "routes": routes})
-        else:
-            remote = (f"{self.of_agent}, from {printable(f'{r.peer} {r.node}')}: {self.remote(r)}" for r in routes)
-            click.echo("\n\t".join([self.text(), *remote]))
-
-    def _arriving(self) -> tuple[RouteInfo, ...]:
-        """The routes of the topic's remote sources from which a message has come."""
-        info = ask_agent(self.master, self.wanted.name)
-        routes = (route for route in (info.routes if info else ()) if route.direction == "in" and route.messages)
-        return tuple(route for route in routes if self.wanted.peer in (None, route.peer))
-
-    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:  # noqa: ARG002 - of delays alone
-        """For JSON, in base units; ``source`` is what measured them."""
-        return {"source": self.source, **self.own()}
-
-    @abstractmethod
-    def own(self) -> dict[str, float]:
-        """The figures of this command's subscriber, in base units."""
-
-    @abstractmethod
-    def text(self) -> str:
-        """The subscriber's figures as text."""
-
-    @abstractmethod
-    def remote(self, route: RouteInfo) -> str:
-        """The agent's figures of a remote source as text."""
-
-
-class _Rate(_Figures):
-    """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
-
-    def own(self) -> dict[str, float]:
-        p = SampleSpread.of(self.periods)
-        rate = 1 / p.mean if p.mean > 0 else math.nan
-        return {"rate": rate, "min": p.min, "max": p.max, "sd": p.sd, "window": p.count + 1}
-
-    def text(self) -> str:
-        v = self.own()
-        if v["window"] < 2:
-            return "one message, no rate yet"
-        spread = f"min: {v['min']:.3f}s max: {v['max']:.3f}s std dev: {v['sd']:.5f}s window: {v['window']}"
-        return f"average rate: {v['rate']:.3f}\n\t{spread}"
-
-    def remote(self, route: RouteInfo) -> str:
-        return _rate_text(route)
-
-
-class _Bandwidth(_Figures):
-    """Bytes a second, in the format of ``rostopic bw``."""
-
-    def own(self) -> dict[str, float]:
-        s, elapsed = SampleSpread.of(self.sizes), math.fsum(self.periods)
-        first = self.sizes[0] if len(self.sizes) > len(self.periods) else 0  # came before the first period
-        rate = (sum(self.sizes) - first) / elapsed if elapsed > 0 else math.nan
-        return {"bandwidth": rate, "mean": s.mean, "min": s.min, "max": s.max, "window": s.count}
-
-    def text(self) -> str:
-        v = self.own()
-        spread = f"mean: {size(v['mean'])} min: {size(v['min'])} max: {size(v['max'])} window: {v['window']}"
-        return f"average: {size(v['bandwidth'])}/s\n\t{spread}"
-
-    def remote(self, route: RouteInfo) -> str:
-        return _bandwidth_text(route)
-
-
-class _Delay(_Figures):
-    """Age on arrival, in seconds.
-
-    By the header's stamp, exact only as far as both machines' clocks agree; and for a remote source by the agent,
-    which knows the clocks' offset. Without a header only the latter is known.
-    """
-
-    of_agent = "by the link's clock"
-
-    def add(self, received: Received, now: float) -> None:
-        """One message.
-
-        Raises:
-            RmpaError: Its type has no header, and it did not come over the mesh.
-        """
-        super().add(received, now)
-        if any(field.name == "header" and field.type == "std_msgs/Header" for field in received.kind.fields):
-            stamp = received.message.header.stamp
-            self.delays.append((received.stamp_ns - stamp.sec * 1_000_000_000 - stamp.nanosec) / 1e9)
-        elif self.master.agent is None or proxied_peer(received.caller_id) is None:
-            problem = f"{received.kind.name} has no header, so it has no stamp to measure its age by"
-            raise RmpaError(problem, code="invalid-value")
-
-    def values(self, routes: tuple[RouteInfo, ...]) -> dict[str, object]:
-        """Seconds; without headers those of the agent, if there is one remote source."""
-        latency = routes[0].latency if len(routes) == 1 and not self.delays else None
-        if latency is None:
-            return {"source": "header" if self.delays else "link", "error": None, **self.own()}
-        spread = {"delay": latency.mean, "min": latency.min, "max": latency.max, "sd": latency.sd}
-        return {"source": "link", "error": latency.error, **spread, "window": latency.count}
-
-    def own(self) -> dict[str, float]:
-        s = SampleSpread.of(self.delays)
-        return {"delay": s.mean, "min": s.min, "max": s.max, "sd": s.sd, "window": s.count}
-
-    def text(self) -> str:
-        """As ``rostopic delay``, with a digit more."""
-        if not self.delays:
-            return "no header, so no stamp to measure the whole age by"
-        v = self.own()
-        spread = f"min: {v['min']:.4f}s max: {v['max']:.4f}s std dev: {v['sd']:.5f}s window: {v['window']}"
-        return f"average delay: {v['delay']:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"
-
-    def remote(self, route: RouteInfo) -> str:
-        return _latency_text(route.latency)
-
-
-def _watch(make: type[_Figures], topic: str, window: int, count: int | None, options: Options) -> None:
     wanted = read_name(topic)
-    master, graph = options.graph()
-    require_peer(master, graph, wanted)
-    warn_unpublished(master, graph, wanted)
-    figures = make(master, wanted, window)
+    master, graph = options.graph(wanted)
+    master.warn_unpublished(graph, wanted)
+    seen, shown = _Window(window), -1
 
     def take(received: Received) -> None:
-        figures.add(received, time.monotonic())
-        if figures.messages == count:
+        seen.add(received, time.monotonic())
+        if delays:
+            seen.add_delay(received, by_link=master.agent is not None)
+        if seen.messages == count:
             raise Enough
 
-    run_stream(lambda: watch_topic(master, wanted, take, lambda: figures.show(as_json=options.as_json)))
+    async def show() -> None:
+        nonlocal shown
+        before, shown = shown, seen.messages
+        if before in (-1, shown):
+            if not options.as_json:
+                print_text("no new messages" if before >= 0 else f"subscribed to [{wanted}]")
+            return
+        routes = await asyncio.to_thread(_arriving, master, wanted)
+        values, text = measure(seen, routes)
+        if options.as_json:
+            print_json({"topic": str(wanted), **values, "routes": routes})
+            return
+        by = "by the link's clock" if delays else "at the agent"
+        lines = (f"{by}, from {printable(f'{each.peer} {each.node}')}: {remote(each)}" for each in routes)
+        click.echo("\n\t".join([text, *lines]))
+
+    run_stream(lambda: master.watch(wanted, take, show))
 
 
 def _figures_verb(window: int) -> Callable[[Callable[..., None]], click.Command]:
     """A ``graph_verb`` of a topic, with ``--window`` and ``--count``."""
     type_ = click.IntRange(2, 1_000_000)
     how_many = "Over how many messages."
-    messages = click.option("-w", "--window", type=type_, default=window, show_default=True, help=how_many)
+    messages = option("-w --window", help=how_many, type=type_, default=window, show_default=True)
     return graph_verb(argument("topic", topics), messages, count_option("messages"))
 
 
@@ -504,7 +483,7 @@ def topic_hz(topic: str, window: int, count: int | None, options: Options) -> No
       rmpa topic hz /cmd
       rmpa topic hz joystick:/cmd -w 100 --json
     """
-    _watch(_Rate, topic, window, count, options)
+    _watch(_rate, _rate_text, topic, window, count, options)
 
 
 @_figures_verb(100)
@@ -520,7 +499,7 @@ def topic_bw(topic: str, window: int, count: int | None, options: Options) -> No
       rmpa topic bw /camera/image_raw -w 30
       rmpa topic bw base:/map --json
     """
-    _watch(_Bandwidth, topic, window, count, options)
+    _watch(_bandwidth, _bandwidth_text, topic, window, count, options)
 
 
 @_figures_verb(50_000)
@@ -541,4 +520,4 @@ def topic_delay(topic: str, window: int, count: int | None, options: Options) ->
 
     # The modules that read messages take 0.3 s to import, which would count as the first message's delay.
     MessageType("std_msgs/Header").make()
-    _watch(_Delay, topic, window, count, options)
+    _watch(_delay, _delay_text, topic, window, count, options, delays=True)

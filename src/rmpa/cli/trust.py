@@ -1,87 +1,51 @@
-"""``rmpa trust``: this module's part in a secured mesh, and what others may do here."""
+"""``rmpa trust``: this module's part in a secured mesh, how modules join it, and what others may do here."""
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import os
+import re
+import signal
 import socket
+import sys
 import time
+from base64 import b64encode
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
+import msgspec
 
-from rmpa.cli.completion import peers
-from rmpa.cli.module import agent_settings, find_module
-from rmpa.cli.options import Options, argument, config_option, flag, json_verb
-from rmpa.cli.output import Table, confirm, duration, warn
-from rmpa.cli.units import STATE
-from rmpa.config import module_name
+from rmpa.cli.module import agent_settings, check_library, find_module, keep_member_name, module_verb
+from rmpa.cli.options import Options, argument, config_option, flag, json_verb, option, peers
+from rmpa.cli.output import Table, confirm, duration, print_json, warn
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
-from rmpa.config.read import load_settings
-from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import is_global_name, peer_name_problem
 from rmpa.runtime.systemd import restart_text
-from rmpa.trust.permissions import Permissions, TrustReply, TrustStatus, action_topics
-from rmpa.trust.store import TrustStore, keys_elsewhere, modules_with_keys
+from rmpa.trust import limits
+from rmpa.trust.permissions import (
+    InviteReply,
+    JoinStep,
+    Permissions,
+    TrustError,
+    TrustReply,
+    TrustStatus,
+    action_topics,
+)
+from rmpa.trust.store import keys_elsewhere, modules_with_keys
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from rmpa.cli.module import Module
     from rmpa.cli.output import Text
+    from rmpa.trust.store import MemberFiles
 
-# The codes of files that this user cannot use.
-_CLOSED: Final = ("keys-unusable", "directory-unusable")
+_LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")
+_UNITS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400}
+_FINGERPRINT: Final = 2 * limits.FINGERPRINT_BYTES
 _WORDS: Final = (*(access.value for access in Access), ACTION_CLIENT, ACTION_SERVER)
-
-
-def trust_verb(*parameters: Any) -> Callable[[Callable[..., None]], click.Command]:
-    """A ``json_verb`` with ``--name`` and ``--config``, whose function gets the module that they mean."""
-    name_option = click.option(
-        "--name",
-        metavar="NAME",
-        help="This module. [default: RMPA_AGENT, RMPA_NAME, rmpa.toml, the agent that runs; else as rmpa up has it]",
-    )
-
-    def decorate(function: Callable[..., None]) -> click.Command:
-        @functools.wraps(function)
-        def command(name: str | None, config: str | None, options: Options, **given: Any) -> None:
-            module = find_module(name, {"config": config}, os.environ)
-            try:
-                function(module, options, **given)
-            except StartError as error:
-                if not (os.geteuid() and module.state == Path(STATE) and error.code in _CLOSED):
-                    raise
-                words = click.get_current_context().command_path
-                problem, remedy = f"the keys of {module.name} are the service's", f"sudo {words} …"
-                raise StartError(words, problem, remedy, code="root-needed") from None
-
-        return json_verb(*parameters, name_option, config_option)(command)
-
-    return decorate
-
-
-def keep_member_name(module: Module) -> str:
-    """Keep the name of a module that has keys now as that of this machine; return the command that starts it.
-
-    The name of another module that has keys itself stays. A gateway's is none of a module.
-    """
-    if unnoted := module_name.note_state_dir(module.place):
-        missed = f"a start without RMPA_STATE_DIR={module.place} will miss these keys: {unnoted}"
-        warn(f"{missed}; write require = true into [trust] of rmpa.toml", "directory-unusable")
-    if module.name.endswith(module_name.GATEWAY_SUFFIX):
-        return f"rmpa gateway --name {module.name}"
-    usual = ""
-    try:
-        kept = module_name.kept_name(module.place)
-        if not kept or kept == module.name or not TrustStore(module.place, kept).exists:
-            module_name.keep_name(module.place, module.name, instead=True)
-        config = {"config": module.loaded.settings.config_file}
-        usual = load_settings(config, os.environ, host_name=socket.gethostname()).settings.name
-    except RmpaError as error:
-        warn(f"the name {module.name} is not kept: {error}", "directory-unusable")
-    return "rmpa up" if usual == module.name else f"rmpa up --name {module.name}"
 
 
 def date_of(wall: float) -> str:
@@ -100,8 +64,7 @@ def grouped(digits: str) -> str:
     argument("name"),
     config_option,
 )
-@click.pass_context
-def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
+def trust_check(peer: str, what: str, name: str, config: str | None, options: Options) -> int:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
     PEER is a module, a site, ros2, or web for the clients of rmpa web. Without --config the rules are those that the
@@ -131,12 +94,10 @@ def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str
     options.show({**shown, "groups": permissions.groups_of(peer), "files": files}, text)
     if not files and not options.as_json:
         warn("no rmpa.toml was found here; --config names the file that rmpa up was started with", "doubtful-setting")
-    ctx.exit(0 if decision.allowed else 1)
+    return 0 if decision.allowed else 1
 
 
-@trust_verb(
-    click.option("--label", metavar="TEXT", default="", help="A name for the mesh, which its certificates contain.")
-)
+@module_verb(option("--label", "TEXT", "A name for the mesh, which its certificates contain.", default=""))
 def trust_init(module: Module, options: Options, label: str) -> None:
     """Make a secured mesh. This module becomes its authority: it invites, renews and revokes.
 
@@ -168,7 +129,7 @@ def trust_init(module: Module, options: Options, label: str) -> None:
     options.show(status, text())
 
 
-@trust_verb()
+@module_verb()
 def trust_status(module: Module, options: Options) -> None:
     """Show this module's part in its mesh: certificate, keys, deny list; at the authority also members and tokens.
 
@@ -238,7 +199,7 @@ def _mesh(shown: TrustStatus) -> Iterator[str | Table]:
             yield Table(titles, rows)
 
 
-@trust_verb(flag("--group-key", help="At the authority: make a new group key; links stay up."))
+@module_verb(flag("--group-key", "At the authority: make a new group key; links stay up."))
 def trust_renew(module: Module, options: Options, group_key: bool) -> None:
     """Renew this module's certificate now. Agents do it by themselves after half of its time.
 
@@ -282,8 +243,8 @@ def _renew_files(module: Module) -> int:
     return int(membership.certificate.expires)
 
 
-@trust_verb(
-    argument("target", metavar="MODULE"), flag("--force", help="Also if no certificate of that name is known here.")
+@module_verb(
+    argument("target", metavar="MODULE"), flag("--force", "Also if no certificate of that name is known here.")
 )
 def trust_revoke(module: Module, options: Options, target: str, force: bool) -> None:
     """Exclude MODULE from the mesh, at the authority: its certificates are refused everywhere from now on.
@@ -308,7 +269,7 @@ def trust_revoke(module: Module, options: Options, target: str, force: bool) -> 
         warn("no agent runs here: the other modules learn it when it is started (rmpa up)", "no-agent")
 
 
-@trust_verb(flag("--yes", help="Do not ask."))
+@module_verb(flag("--yes", "Do not ask."))
 def trust_leave(module: Module, options: Options, yes: bool) -> None:
     """Remove this module's keys and certificate: after that its agent starts without trust.
 
@@ -333,3 +294,295 @@ def trust_leave(module: Module, options: Options, yes: bool) -> None:
     if module.socket is not None and not options.as_json:
         how = restart_text(module.pid)
         warn(f"the agent {module.name} keeps its membership until you restart it: {how}", "needs-restart")
+
+
+@module_verb(
+    option("--for lifetime", "TIME", "Validity: 90s, 15min, 2h, 3d. [default: 15min]", default="15min"),
+    option(
+        "--module invitee", "MODULE", "Only this module may use it; it may be one that joins again. [default: any]"
+    ),
+    option("--address", "HOST[:PORT]", "Where the module reaches this one. [default: as other agents do]"),
+    flag("--yes", "With --sign: do not ask."),
+    flag("--no-wait", "Print the token and end."),
+    option("--sign", "FILE", "Answer the request of rmpa trust join --request; no token is made."),
+    option("--out", "FILE", "Where --sign writes the answer, a secret. [default: FILE.answer]"),
+)
+def trust_invite(
+    module: Module,
+    options: Options,
+    lifetime: str,
+    invitee: str | None,
+    address: str | None,
+    yes: bool,
+    no_wait: bool,
+    sign: str | None,
+    out: str | None,
+) -> None:
+    """Invite a module, at the authority: print a token that is valid once, and wait until it has joined.
+
+    On a terminal the line to run on the new module is printed, with the token; else only the token, on standard
+    output. The holder of the token can join: keep it secret.
+
+    ---
+    With --json one object a line is printed: the token, then each step, whose state is refused or joined. A token
+    that was refused is still valid.
+
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust invite                          print the line for the new module, and wait
+      rmpa trust invite --module arm2 --for 2d   for one module, valid for two days
+      rmpa trust invite --no-wait | ssh arm2 rmpa trust join -
+                                                 by a script
+      rmpa trust invite --sign arm2.csr          answer a join by files
+    """
+    if invitee and (problem := peer_name_problem(invitee)):
+        raise ConfigError("--module", problem)
+    seconds = _seconds(lifetime)
+    host, port = _address(address)
+    if sign is not None:
+        _sign(module, Path(sign), Path(out or f"{sign}.answer"), invitee or "", options, yes=yes)
+        return
+    if module.agent != "secured":
+        module.authority()  # the better error, if this module is none
+        problem, remedy = "does not run", "start it: rmpa up"
+        if module.socket is not None:
+            problem, remedy = "runs without its keys", f"restart it: {restart_text(module.pid)}"
+        raise StartError(f"the agent {module.name}", f"{problem}, so no module can join", remedy, code="not-a-member")
+    invited = module.call("invite", InviteReply, name=invitee or "", lifetime=seconds, address=host, port=port)
+    for number in () if no_wait else (signal.SIGHUP, signal.SIGTERM):  # its terminal is closed, too
+        signal.signal(number, signal.default_int_handler)
+    try:
+        if not options.as_json:
+            until = date_of(invited.expires)
+            click.echo(f"for {invitee or 'one module'}, valid once, until {until}; run there:", err=True)
+        named = f" --name {invitee}" if invitee else ""
+        options.show(invited, f"rmpa trust join{named} {invited.token}" if sys.stdout.isatty() else invited.token)
+        sys.stdout.flush()
+        if not no_wait:
+            _await_join(module, invited, as_json=options.as_json)
+    except (KeyboardInterrupt, click.Abort):
+        with contextlib.suppress(RmpaError):
+            if module.call("withdraw", TrustReply, id=invited.id).done:
+                click.echo("\nthe token is withdrawn", err=True)
+        raise
+
+
+def _await_join(module: Module, invited: InviteReply, *, as_json: bool) -> None:
+    """Wait until a module has joined with the token; one that was refused may try again."""
+    step = JoinStep(step=0, state="waiting")
+    if not as_json:
+        click.echo("waiting for the module; Ctrl-C withdraws the token", err=True)
+    while step.state != "joined":
+        following = module.call("step", JoinStep, id=invited.id, after=step.step)
+        if following.step == step.step:
+            if time.time() > invited.expires:
+                problem = "the token has ended, and no module came"
+                raise PeerRefused("the authority", problem, "rmpa trust invite again", code="token-refused")
+            continue
+        step = following
+        if as_json:
+            print_json(step)
+        elif step.state == "refused":
+            warn(f"{step.module} was refused: {step.text} ({step.reason}); the token is still valid", "token-refused")
+        else:
+            click.echo(f"{step.module} has joined", err=True)
+
+
+def _sign(module: Module, request: Path, out: Path, invitee: str, options: Options, *, yes: bool) -> None:
+    """Answer a join by files."""
+    check_library()
+    from rmpa.trust import certificates
+    from rmpa.trust.membership import request_der
+    from rmpa.trust.tokens import fingerprint_of
+
+    try:
+        with request.open("rb") as stream:
+            data = request_der(stream.read(limits.JOIN_REQUEST_MAX))
+        wanted = certificates.read_request(data)
+    except OSError as error:
+        raise ConfigError(str(request), f"cannot be read: {error.strerror}") from None
+    except (ValueError, TrustError) as error:
+        remedy = "make it by rmpa trust join --request FILE"
+        raise ConfigError(str(request), f"is no request: {error}", remedy) from None
+    if invitee and invitee != wanted.name:
+        raise ConfigError("--module", f"is {invitee}, and the request is of {wanted.name}")
+    if out.exists():  # before a certificate takes the name
+        raise ConfigError(str(out), "exists already", "choose another --out, or remove it")
+    key = wanted.key_hash[: limits.FINGERPRINT_BYTES].hex()
+    click.echo(f"{wanted.name} asks with the key {grouped(key)}", err=True)
+    if not yes and not confirm(f"Does {wanted.name} show this key?"):
+        raise ConfigError("rmpa trust invite --sign", "nothing was signed", code="not-confirmed")
+    if module.agent == "secured":
+        reply = module.call("sign", dict[str, str], request=b64encode(data).decode(), module=invitee)
+        answer = reply["answer"].encode()
+    else:
+        answer = msgspec.json.encode(module.authority().join_file(data, invitee)[1])
+    _write_secret(out, answer)
+    ca = fingerprint_of(module.membership().files.ca).hex()
+    options.show(
+        {"module": wanted.name, "key": key, "file": str(out)},
+        f"{out} is the answer, a secret: bring it to {wanted.name}, and delete it then",
+        f"there: rmpa trust join --accept {out.name} --ca {ca} --name {wanted.name}",
+    )
+
+
+def _write_secret(path: Path, data: bytes) -> None:
+    """Write a new file that only this user can read."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+    except FileExistsError:
+        raise ConfigError(str(path), "exists already", "choose another --out, or remove it") from None
+    except OSError as error:
+        raise StartError(str(path), f"cannot be written: {error.strerror}", code="directory-unusable") from None
+
+
+def _seconds(text: str) -> float:
+    match = _LIFETIME.fullmatch(text.strip())
+    seconds = int(match[1]) * _UNITS[match[2]] if match else 0
+    if not 0 < seconds <= limits.TOKEN_LIFETIME_MAX:
+        most = limits.TOKEN_LIFETIME_MAX / 86_400
+        raise ConfigError("--for", f"{text!r} is not a time up to {most:.0f} d", "write 90s, 15min, 2h or 3d")
+    return float(seconds)
+
+
+def _address(text: str | None) -> tuple[str, int | None]:
+    """The host as an IPv4 address, and the port, of ``--address``; empty and ``None`` where it is not given."""
+    if text is None:
+        return "", None
+    host, _, port = text.partition(":")
+    if port and not (port.isascii() and port.isdigit() and 0 < int(port) < 65_536):
+        raise ConfigError("--address", f"{port!r} is no port", "write HOST or HOST:PORT")
+    try:
+        return socket.gethostbyname(host), int(port) if port else None
+    except OSError as error:
+        raise ConfigError("--address", f"{host!r} has no IPv4 address: {error}") from None
+
+
+@module_verb(
+    argument("token", required=False),
+    option("--request", "FILE", "Join by files: write the request."),
+    option("--accept", "FILE", "Join by files: read the answer."),
+    option("--ca", "FINGERPRINT", "With --accept: the fingerprint of the CA, as rmpa trust invite --sign shows it."),
+)
+def trust_join(
+    module: Module, options: Options, token: str | None, request: str | None, accept: str | None, ca: str | None
+) -> None:
+    """Join a secured mesh with a TOKEN of rmpa trust invite; - reads it from standard input.
+
+    The token proves each side to the other: a third machine between them cannot join or listen without it.
+
+    ---
+    Exit codes: 0 done; 1 not done, with the reason on stderr; 2 a wrong option or name.
+
+    Examples:
+      rmpa trust join rmpa1-...                 with a token of rmpa trust invite
+      rmpa trust join -                         the token from standard input, not in the process list
+      rmpa trust join --request arm2.csr        offline: bring this file to the authority ...
+      rmpa trust join --accept arm2.csr.answer --ca 4f2a...   ... and its answer back
+    """
+    if sum(each is not None for each in (token, request, accept)) != 1:
+        raise ConfigError("rmpa trust join", "needs a TOKEN, --request or --accept", "see rmpa trust join --help")
+    module.refuse_member("first, to join again")
+    if request is not None:
+        _write_request(module, Path(request), options)
+        return
+    files = _accepted(module, Path(accept), ca) if accept is not None else _join_by_token(module, token or "")
+    module.store.save(files)
+    module.store.forget("request.key")
+    start = keep_member_name(module)
+    from rmpa.trust import certificates
+
+    found = certificates.verify(files.certificate, files.ca, None)
+    done = f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before"
+    options.show(TrustReply(module=found.name, done=True, expires=int(found.expires)), done)
+    if options.as_json:
+        return
+    if text := _clock_problem(time.time(), found.issued, by_files=accept is not None):
+        warn(text, "clock-skew")
+    if module.socket is not None:
+        warn(module.restart(start), "needs-restart")
+    else:
+        click.echo(f"Next: {start}; what a module may do here: rmpa trust check PEER publish /TOPIC")
+
+
+def _clock_problem(wall: float, issued: float, *, by_files: bool) -> str:
+    """What is wrong with this machine's clock, by a certificate that was issued just now; empty: nothing."""
+    off = wall - issued
+    if abs(off) <= limits.CLOCK_TOLERANCE or (by_files and off > 0):
+        return ""
+    here = f"the clock of this machine shows {date_of(wall)}, the authority's {date_of(issued)}"
+    if off < -limits.CERTIFICATE_BACKDATE:
+        return f"{here}: it counts as not set, and no times are checked until it is (timedatectl, chrony)"
+    return f"{here}: links are refused while they differ by more than {limits.CLOCK_TOLERANCE:.0f} s; set it"
+
+
+def _join_by_token(module: Module, text: str) -> MemberFiles:
+    import asyncio
+
+    from rmpa.trust.joining import join_mesh
+    from rmpa.trust.store import AuthorityPlace
+    from rmpa.trust.tokens import Token, TokenError
+
+    try:
+        token = Token.parse(sys.stdin.readline() if text == "-" else text)
+    except TokenError as error:
+        raise ConfigError("TOKEN", str(error), code="token-refused") from None
+    module.store.check_writable()  # before the token is used up
+    files = asyncio.run(join_mesh(token, module.name))
+    module.store.save_authority(AuthorityPlace("", str(token.address), token.port))
+    return files
+
+
+def _write_request(module: Module, out: Path, options: Options) -> None:
+    from rmpa.trust import certificates
+    from rmpa.trust.membership import new_key, private_key, request_pem
+    from rmpa.trust.store import REQUEST_KEY
+
+    pem = new_key()
+    request = certificates.make_request(private_key(pem, REQUEST_KEY), module.name)
+    key = certificates.read_request(request).key_hash[: limits.FINGERPRINT_BYTES].hex()
+    module.store.write(REQUEST_KEY, pem)
+    try:
+        out.write_bytes(request_pem(request))
+    except OSError as error:
+        raise StartError(str(out), f"cannot be written: {error.strerror}", code="directory-unusable") from None
+    options.show(
+        {"module": module.name, "key": key, "file": str(out)},
+        f"{out} is the request of {module.name}, with the key {grouped(key)}; it is no secret",
+        f"at the authority: rmpa trust invite --sign {out.name}",
+    )
+
+
+def _accepted(module: Module, path: Path, ca: str | None) -> MemberFiles:
+    """The files of the answer in a join by files.
+
+    Raises:
+        ConfigError: It is no answer, or of another authority, another module or another key.
+    """
+    from rmpa.trust import certificates
+    from rmpa.trust.joining import check_grant
+    from rmpa.trust.membership import private_key
+    from rmpa.trust.store import REQUEST_KEY, MemberFiles
+    from rmpa.trust.tokens import CertificateGrant
+
+    digits = re.sub(r"[\s:]", "", ca or "").lower()
+    if not re.fullmatch(rf"[0-9a-f]{{{_FINGERPRINT}}}", digits):
+        raise ConfigError("--ca", f"is not {_FINGERPRINT} hexadecimal digits", "rmpa trust invite --sign shows them")
+    pem = module.store.load_request_key()
+    own = certificates.make_request(private_key(pem, REQUEST_KEY), module.name)
+    try:
+        with path.open("rb") as stream:
+            answer = msgspec.json.decode(stream.read(limits.JOIN_ANSWER_MAX + 1), type=CertificateGrant)
+        certificates.check_ca(answer.ca, bytes.fromhex(digits))
+        check_grant(answer, module.name, own)
+    except OSError as error:
+        raise ConfigError(str(path), f"cannot be read: {error.strerror}") from None
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise ConfigError(str(path), f"is no answer of rmpa trust invite --sign: {error!s:.100}") from None
+    except TrustError as error:
+        text = str(error).replace("of the token", "of --ca")
+        raise ConfigError(str(path), text, "is it the answer to this module's last request?") from None
+    return MemberFiles(pem, answer.certificate, answer.ca, answer.keys, answer.deny)

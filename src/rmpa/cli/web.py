@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import click
 
 from rmpa.cli.module import agent_settings, check_web, find_module
-from rmpa.cli.options import Options, agent_verb, config_option, flag
+from rmpa.cli.options import Options, agent_verb, config_option, flag, option
 from rmpa.cli.output import Painted, begin_log
 from rmpa.config.read import INSECURE
 from rmpa.config.settings import WebSettings
@@ -34,32 +34,25 @@ _DEFAULTS: Final = WebSettings()
 
 
 @agent_verb(
-    click.option("--port", type=click.IntRange(1, 65535), help=f"Port to listen at. [default: {_DEFAULTS.port}]"),
-    click.option(
+    option("--port", help=f"Port to listen at. [default: {_DEFAULTS.port}]", type=click.IntRange(1, 65535)),
+    option(
         "--listen",
-        metavar="ADDRESS",
-        help=f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
+        "ADDRESS",
+        f"Address to listen at; beyond this machine a token is needed. [default: {_DEFAULTS.listen}]",
     ),
-    click.option(
+    option(
         "--token-file",
-        metavar="FILE",
-        help="Ask clients for the token of this file; made if it is missing. [default: in the state directory]",
+        "FILE",
+        "Ask clients for the token of this file; made if it is missing. [default: in the state directory]",
     ),
-    click.option(
-        "--host", "hosts", metavar="NAME", multiple=True, help="A further name of this server in URLs; repeatable."
-    ),
-    flag(
-        "--control",
-        help="Let clients publish, call and offer services, and set parameters; they then need the token.",
-    ),
-    click.option(
-        "--cert", metavar="FILE", help="HTTPS with this certificate (PEM). [default: the module's, if secured]"
-    ),
-    click.option("--key", metavar="FILE", help="Its private key (PEM). [default: in the certificate's file]"),
-    flag("--drive", help="Let the joystick of its pages command a robot; they need the token."),
+    option("--host hosts", "NAME", "A further name of this server in URLs; repeatable.", multiple=True),
+    flag("--control", "Let clients publish, call and offer services, and set parameters; they then need the token."),
+    option("--cert", "FILE", "HTTPS with this certificate (PEM). [default: the module's, if secured]"),
+    option("--key", "FILE", "Its private key (PEM). [default: in the certificate's file]"),
+    flag("--drive", "Let the joystick of its pages command a robot; they need the token."),
     config_option,
-    flag("--insecure", help="Start without an agent although other modules here have keys."),
-    flag("--check", help="Only check that it could start with these settings."),
+    flag("--insecure", "Start without an agent although other modules here have keys."),
+    flag("--check", "Only check that it could start with these settings."),
 )
 def web(config: str | None, insecure: bool, check: bool, options: Options, **given: Any) -> int:
     """Show the mesh in a browser; serve rosbridge and Foxglove clients, /metrics for Prometheus, /api/v1 as JSON.

@@ -17,7 +17,7 @@ from rmpa.core.timers import Backoff
 from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
 from rmpa.gateway.zenoh.session import open_trusted_session
-from rmpa.observe.control import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
+from rmpa.observe.control_client import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 from rmpa.runtime.plugins import NEIGHBOURS, load_plugins, plugin_error
 from rmpa.runtime.tasks import keep_task, start_task
 

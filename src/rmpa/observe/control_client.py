@@ -1,10 +1,22 @@
-"""The client of the control socket, the search for this machine's agents, and the lock of an agent's name."""
+"""The protocol of the control socket, its client, and the search for this machine's agents.
+
+The protocol of the control socket: one JSON object a line each way.
+
+::
+
+    {"op": "ping", "args": {"peer": "base", "count": 1}}
+    {"ok": true, "value": {"times": [0.0004], "remote": "10.0.0.2:40001"}}
+    {"ok": false, "error": "no peer named 'bse'", "remedy": "did you mean base?", "code": "unknown-name"}
+
+A long ``text`` in the arguments or the value is not part of the JSON, whose reading would delay data: ``follows`` has
+the number of its bytes, and they follow the line.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
+import functools
 import grp
 import os
 import socket
@@ -12,24 +24,202 @@ import stat
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 import msgspec
 
-from rmpa.bridge.messages import with_text
+from rmpa.bridge.messages import with_text, without_text
 from rmpa.config.module_name import NameSource, running_agent
-from rmpa.core.errors import ConfigError, PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.core.errors import (
+    ConfigError,
+    LimitExceeded,
+    LocalProtocolError,
+    PeerRefused,
+    RemoteProtocolError,
+    RmpaError,
+    UnreachableError,
+)
 from rmpa.core.limits import KIB
 from rmpa.observe import limits
-from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply, ControlRequest
 from rmpa.observe.snapshot import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from types import TracebackType
 
+    from rmpa.core.timers import Yielder
     from rmpa.observe.snapshot import AgentInfo
+
+
+class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):
+    """The settings as read again, against those that the agent runs with.
+
+    Attributes:
+        file: The file that was read, or empty if there is none.
+        changed: The keys whose new values hold from now on (or would, for a check): ``bridge.deny``, ``[[peer]]``.
+        restart: Those that hold after a restart only, each with both values: ``mesh.port (40001 instead of 0)``.
+        notes: Doubtful settings, each ready to read.
+        problem: Why the settings cannot be used, with the file's line, and nothing has changed; empty if they can.
+        code: The problem's code (``core.codes``).
+    """
+
+    file: str = ""
+    changed: tuple[str, ...] = ()
+    restart: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    problem: str = ""
+    code: str = ""
+
+
+# Elements of a list in one piece: some 50 microseconds where they are topics.
+_BATCH: Final = 16
+
+
+def json_pieces(value: object) -> Iterator[bytes]:
+    """The output of ``msgspec.json.encode`` in pieces: long lists, also those in fields of structs, are cut.
+
+    Args:
+        value: Must not change meanwhile.
+
+    Raises:
+        TypeError, ValueError, RecursionError: JSON cannot hold it.
+    """
+    if isinstance(value, list | tuple) and len(value) > _BATCH:
+        yield from _list(value)
+    elif isinstance(value, msgspec.Struct) and not type(value).__struct_config__.tag:
+        yield from _struct(value)
+    else:
+        yield msgspec.json.encode(value)
+
+
+def _list(values: Sequence[object]) -> Iterator[bytes]:
+    for begin in range(0, len(values), _BATCH):
+        yield b"[" if begin == 0 else b","
+        yield msgspec.json.encode(values[begin : begin + _BATCH])[1:-1]
+    yield b"]"
+
+
+def _struct(value: msgspec.Struct) -> Iterator[bytes]:
+    separator = b"{"
+    for name, start, default in _members(type(value)):
+        content = getattr(value, name)
+        if default is not msgspec.NODEFAULT and content == default:
+            continue
+        yield separator + start
+        yield from json_pieces(content)
+        separator = b","
+    yield b"{}" if separator == b"{" else b"}"
+
+
+@functools.cache  # to read the annotations of a type takes as long as to write a small struct
+def _members(kind: type[msgspec.Struct]) -> tuple[tuple[str, bytes, object], ...]:
+    """Of each field its name, its JSON up to the value, and the value that is left out, ``NODEFAULT`` for none."""
+    omit = kind.__struct_config__.omit_defaults
+    return tuple(
+        (each.name, msgspec.json.encode(each.encode_name) + b":", _default(each) if omit else msgspec.NODEFAULT)
+        for each in msgspec.structs.fields(kind)
+    )
+
+
+def _default(field: msgspec.structs.FieldInfo) -> object:
+    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+
+
+# The operation that only an agent with another role than a module's serves; its value names that.
+ROLE: Final = "role"
+# The role of the agent in ``rmpa gateway``.
+GATEWAY_ROLE: Final = "gateway"
+# The operation of a gateway that says what it joins; its ``problem`` is why it joins nothing.
+GATEWAY_REPORT: Final = "gateway"
+
+
+class _Line(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A line of the protocol."""
+
+    _NAME: ClassVar[str]
+    _MOST: ClassVar[int]
+
+    @classmethod
+    def parse(cls, line: bytes) -> Self:
+        """Parse one line, with or without its end.
+
+        Raises:
+            RemoteProtocolError: It is none.
+        """
+        if len(line) > cls._MOST:
+            raise LimitExceeded(f"a {cls._NAME}", len(line), cls._MOST)
+        try:
+            return msgspec.json.decode(line, type=cls)
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+            raise RemoteProtocolError(f"not a {cls._NAME}: {error}") from None
+
+
+class ControlRequest(_Line, frozen=True, omit_defaults=True):
+    """A client's request.
+
+    Attributes:
+        op: The name of an operation (``observe.operations``).
+        args: Its arguments, by name.
+        follows: Bytes of the argument ``text`` that follow the line.
+    """
+
+    _NAME = "control request"
+    _MOST = limits.CONTROL_REQUEST_MAX
+    op: str
+    args: dict[str, object] = {}
+    follows: int = 0
+
+    def serialize(self) -> bytes:
+        """One line."""
+        args, text = without_text(self.args)
+        return msgspec.json.encode(msgspec.structs.replace(self, args=args, follows=len(text))) + b"\n" + text
+
+    def __str__(self) -> str:
+        """The op and the names of its arguments, safe to log."""
+        shown = f"{self.op}({', '.join(self.args)})"
+        return shown[:200].encode("unicode_escape").decode("ascii")
+
+
+class ControlReply(_Line, frozen=True, omit_defaults=True):
+    """The agent's reply.
+
+    Attributes:
+        ok: Whether ``value`` is the result; else ``error`` says why there is none and ``remedy`` what to do.
+        value: Anything that JSON can hold.
+        error: What happened.
+        remedy: What to do; may be empty.
+        follows: Bytes of the value's ``text`` that follow the line.
+        code: The error's code (``core.codes``).
+    """
+
+    _NAME = "control reply"
+    _MOST = limits.CONTROL_REPLY_MAX
+    ok: bool
+    value: Any = None  # the edge: each operation has its own type, and its caller converts the value
+    error: str = ""
+    remedy: str = ""
+    follows: int = 0
+    code: str = ""
+
+    def serialize(self, yielder: Yielder = iter) -> bytes:
+        """One line.
+
+        Args:
+            yielder: Yields to data between the pieces of a large reply, which take some 50 microseconds each.
+
+        Raises:
+            LocalProtocolError: The value is something that JSON cannot hold, or too large.
+        """
+        try:
+            value, text = without_text(self.value)
+            reply = msgspec.structs.replace(self, value=value, follows=len(text))
+            line = b"".join((*yielder(json_pieces(reply)), b"\n", text))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise LocalProtocolError(f"a handler's value is not JSON: {error}") from None
+        if len(line) > limits.CONTROL_REPLY_MAX:
+            raise LocalProtocolError(f"a reply of {len(line)} bytes is more than {limits.CONTROL_REPLY_MAX}")
+        return line
 
 
 _SYSTEM: Final = Path("/run/rmpa")
@@ -92,92 +282,6 @@ def closed_to_us() -> str:
         return grp.getgrgid(info.st_gid).gr_name
     except (OSError, KeyError):
         return ""
-
-
-def _unusable(path: Path, problem: str) -> StartError:
-    return StartError(
-        str(path), problem, "set RMPA_RUNTIME_DIR to a directory of your own", code="directory-unusable"
-    )
-
-
-def make_runtime_dir(place: Path, group: int | None = None) -> None:
-    """Make the directory, for this user alone, or for one group too.
-
-    Args:
-        place: The directory.
-        group: The number of the group that may look into it.
-
-    Raises:
-        StartError: It cannot be made or given to the group, or another user owns it.
-    """
-    try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        info = place.lstat()
-        if not stat.S_ISDIR(info.st_mode):
-            raise _unusable(place, "is not a directory")
-        if info.st_uid != os.geteuid():
-            raise _unusable(place, f"belongs to user {info.st_uid}, not to us")
-        if info.st_mode & stat.S_ISVTX:  # such as /tmp, which would be closed to all others
-            raise _unusable(place, "is shared by all users")
-        if group is not None:
-            os.chown(place, -1, group)
-            place.chmod(0o750)
-        elif info.st_mode & 0o077:
-            place.chmod(0o700)
-    except OSError as error:
-        raise _unusable(place, f"cannot be made: {error.strerror}") from None
-
-
-class NameLock:
-    """Holds ``<name>.lock`` while the agent runs; the kernel releases the lock however the agent ends.
-
-    Args:
-        place: The runtime directory; made if needed.
-        name: The agent's name.
-        group: As for ``make_runtime_dir``.
-
-    Raises:
-        StartError: Another agent holds it (the text has its process id), or the directory cannot be used.
-    """
-
-    def __init__(self, place: Path, name: str, group: int | None = None) -> None:
-        make_runtime_dir(place, group)
-        self.path = place / f"{name}.lock"
-        while True:
-            try:
-                fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-            except OSError as error:
-                raise _unusable(self.path, f"cannot be opened: {error.strerror}") from None
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                pid = os.read(fd, 32).decode("ascii", "replace").strip()
-                os.close(fd)
-                whose = f" (pid {pid})" if pid else ""
-                problem = f"an agent named {name!r} already runs on this machine{whose}"
-                remedy = "stop it, or give this one a --name of its own"
-                raise StartError("rmpa up", problem, remedy, code="name-in-use") from None
-            if self._still_there(fd):
-                break
-            os.close(fd)  # the last holder removed the file after it was opened here
-        self._fd = fd
-        with contextlib.suppress(OSError):  # a full disk: the lock holds without the process id in the file
-            os.ftruncate(fd, 0)
-            os.write(fd, f"{os.getpid()}\n".encode())
-
-    def _still_there(self, fd: int) -> bool:
-        try:
-            return self.path.stat().st_ino == os.fstat(fd).st_ino
-        except FileNotFoundError:
-            return False
-
-    def release(self) -> None:
-        """Remove the file and release the lock; may be called twice."""
-        if self._fd >= 0:
-            with contextlib.suppress(OSError):
-                self.path.unlink()
-            os.close(self._fd)
-            self._fd = -1
 
 
 _T = TypeVar("_T")
@@ -246,7 +350,7 @@ class ControlClient:
         """Send a request, and wait for the reply.
 
         Args:
-            op: The name of the operation (``observe.operations.REPLIES``).
+            op: The name of the operation (``observe.operations``).
             type: The type of its value.
             args: Its arguments.
 
@@ -264,6 +368,18 @@ class ControlClient:
         if reply.follows:
             with_text(reply.value, self._received(lambda: self._file.read(reply.follows)))
         return reply.value
+
+    def pass_on(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
+        """As ``call``, of a question that this agent passes on to another one.
+
+        Raises:
+            RmpaError: That one refuses; the text is its own, and has its name.
+        """
+        try:
+            return self.call(op, type, **args)
+        except PeerRefused as error:
+            text = f"{error.reason}; {error.remedy}" if error.remedy else error.reason
+            raise RmpaError(text, code=error.code) from None
 
     async def ask(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
         """As ``call``, in a thread; if it is cancelled, the connection ends."""

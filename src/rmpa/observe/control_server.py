@@ -1,14 +1,16 @@
-"""The server of the control socket, and the users that it serves."""
+"""The server of the control socket, the lock of its agent's name, and the users that it serves."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import grp
 import inspect
 import logging
 import os
 import socket
+import stat
 import struct
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
@@ -19,8 +21,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError, Star
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.observe import limits
-from rmpa.observe.control import ControlReply, ControlRequest
-from rmpa.observe.control_client import NameLock
+from rmpa.observe.control_client import ControlReply, ControlRequest
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.runtime.tasks import OwnedTasks
@@ -70,6 +71,92 @@ def control_group(name: str) -> int | None:
     except KeyError:
         remedy = f"make it (sudo groupadd {name}), or change group of [control]"
         raise StartError("control.group", f"there is no group {name!r}", remedy, code="invalid-value") from None
+
+
+def _unusable(path: Path, problem: str) -> StartError:
+    return StartError(
+        str(path), problem, "set RMPA_RUNTIME_DIR to a directory of your own", code="directory-unusable"
+    )
+
+
+def make_runtime_dir(place: Path, group: int | None = None) -> None:
+    """Make the directory, for this user alone, or for one group too.
+
+    Args:
+        place: The directory.
+        group: The number of the group that may look into it.
+
+    Raises:
+        StartError: It cannot be made or given to the group, or another user owns it.
+    """
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = place.lstat()
+        if not stat.S_ISDIR(info.st_mode):
+            raise _unusable(place, "is not a directory")
+        if info.st_uid != os.geteuid():
+            raise _unusable(place, f"belongs to user {info.st_uid}, not to us")
+        if info.st_mode & stat.S_ISVTX:  # such as /tmp, which would be closed to all others
+            raise _unusable(place, "is shared by all users")
+        if group is not None:
+            os.chown(place, -1, group)
+            place.chmod(0o750)
+        elif info.st_mode & 0o077:
+            place.chmod(0o700)
+    except OSError as error:
+        raise _unusable(place, f"cannot be made: {error.strerror}") from None
+
+
+class NameLock:
+    """Holds ``<name>.lock`` while the agent runs; the kernel releases the lock however the agent ends.
+
+    Args:
+        place: The runtime directory; made if needed.
+        name: The agent's name.
+        group: As for ``make_runtime_dir``.
+
+    Raises:
+        StartError: Another agent holds it (the text has its process id), or the directory cannot be used.
+    """
+
+    def __init__(self, place: Path, name: str, group: int | None = None) -> None:
+        make_runtime_dir(place, group)
+        self.path = place / f"{name}.lock"
+        while True:
+            try:
+                fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            except OSError as error:
+                raise _unusable(self.path, f"cannot be opened: {error.strerror}") from None
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                pid = os.read(fd, 32).decode("ascii", "replace").strip()
+                os.close(fd)
+                whose = f" (pid {pid})" if pid else ""
+                problem = f"an agent named {name!r} already runs on this machine{whose}"
+                remedy = "stop it, or give this one a --name of its own"
+                raise StartError("rmpa up", problem, remedy, code="name-in-use") from None
+            if self._still_there(fd):
+                break
+            os.close(fd)  # the last holder removed the file after it was opened here
+        self._fd = fd
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without the process id in the file
+            os.ftruncate(fd, 0)
+            os.write(fd, f"{os.getpid()}\n".encode())
+
+    def _still_there(self, fd: int) -> bool:
+        try:
+            return self.path.stat().st_ino == os.fstat(fd).st_ino
+        except FileNotFoundError:
+            return False
+
+    def release(self) -> None:
+        """Remove the file and release the lock; may be called twice."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            os.close(self._fd)
+            self._fd = -1
 
 
 class ControlServer:

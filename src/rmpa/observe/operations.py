@@ -1,18 +1,21 @@
-"""The operations of the control socket: ``REPLIES`` has them all. A new operation is a row there and a handler."""
+"""The operations of the control socket, and what programs do by several of them.
+
+``ControlOperations.handlers`` lists them; ``why``, ``reload``, ``graph`` and ``trust`` are the agent's own
+(``agent/agent.py``). Each docstring says what the arguments and the value are.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.kept import Kept
-from rmpa.bridge.launched import ModuleResources
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import owner as param_requests
@@ -24,11 +27,8 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaE
 from rmpa.core.facts import ContractTerm, FollowedInfo
 from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
 from rmpa.observe import limits
-from rmpa.observe.control import ReloadReply
-from rmpa.observe.graph import GraphRevision
 from rmpa.observe.sites import PARAM
-from rmpa.observe.snapshot import INFO, ModuleFacts, PingReply, Snapshot
-from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.observe.snapshot import INFO, PingReply, Snapshot
 from rmpa.ros.environment import NodeLine, PeerNodes
 from rmpa.ros.master.parameters import leaves
 from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from rmpa.observe.snapshot_builder import SnapshotBuilder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
-_T = TypeVar("_T")
 Args = dict[str, Any]
 
 
@@ -74,11 +73,24 @@ class ControlOperations:
     rates: Rates
 
     def handlers(self) -> dict[str, Handler]:
-        """The handlers of the operations of this class, for ``ControlServer``."""
-        names: tuple[str, ...] = ("snapshot", "ping", "param", "followed", "agent", "contract", "node")
-        names += ("log", "log_level", "launch", "top", "record")
-        named = {name: getattr(self, name) for name in names}
-        return {"site": self.sites.answer, "rates": self.topic_rates, **named}
+        """The handler of each operation that is not the agent's own, for ``ControlServer``."""
+        bridge = self.facts.bridge
+        return {
+            "snapshot": self.snapshot,
+            "ping": self.ping,
+            "param": self.param,
+            "followed": self.followed,
+            "agent": self.agent,
+            "contract": self.contract,
+            "rates": self.topic_rates,
+            "site": self.sites.answer,
+            "log": bridge.log.read,
+            "log_level": self.log_level,
+            "launch": bridge.launch.answer,
+            "top": self.top,
+            "record": bridge.recordings.answer,
+            "node": self.node,
+        }
 
     def snapshot(self, args: Args) -> Snapshot:
         """A snapshot, or a part of it.
@@ -156,14 +168,6 @@ class ControlOperations:
         """The facts of a peer's module: ``peer``, its name or GUID."""
         return await self.facts.bridge.rpc.request(self._session(args.get("peer", "")), INFO, {})
 
-    async def log(self, args: Args) -> list[ModuleLog]:
-        """Log lines of this module and its peers: as ``ModuleLogs.read``."""
-        return await self.facts.bridge.log.read(args)
-
-    async def launch(self, args: Args) -> list[ModuleResources]:
-        """List, start, stop or restart resources, or read their logs: as ``Launcher.answer``."""
-        return await self.facts.bridge.launch.answer(args)
-
     async def top(self, args: Args) -> dict[str, Any]:
         """What the nodes of each module cost, by its name; a text where a peer does not tell it.
 
@@ -196,10 +200,6 @@ class ControlOperations:
         if not (peer := args.get("peer")):
             return await self.facts.bridge.log.level(None, request)
         return await self.facts.bridge.rpc.request(self._session(peer), LEVEL, request)
-
-    async def record(self, args: Args) -> Any:
-        """Recordings of this module and its peers: as ``Recordings.answer``."""
-        return await self.facts.bridge.recordings.answer(args)
 
     async def topic_rates(self, _args: Args) -> dict[str, Any]:
         """The rates of the topics that each module publishes, by its name; a text where a peer does not tell them."""
@@ -245,29 +245,6 @@ def _request(args: Args, known: Collection[str]) -> str:
     return what
 
 
-# All operations of the control socket, with the type of the value; ``object``: it depends on the arguments.
-REPLIES: Final[dict[str, object]] = {
-    "snapshot": Snapshot,
-    "ping": PingReply,
-    "why": tuple[Diagnosis, ...],
-    "reload": ReloadReply,
-    "param": object,  # the value that the peer replies
-    "graph": GraphRevision,
-    "followed": tuple[FollowedInfo, ...],
-    "trust": object,  # TrustStatus, or as the command says (trust.status)
-    "agent": ModuleFacts,
-    "contract": dict[str, ContractTerm],
-    "rates": object,  # tuple[TopicRate, ...] or a text, by module
-    "site": object,  # as ``QUESTIONS`` say
-    "log": tuple[ModuleLog, ...],
-    "log_level": dict[str, str],
-    "launch": tuple[ModuleResources, ...],
-    "top": object,  # tuple[NodeCost, ...] or a text, by module
-    "record": object,  # tuple[ModuleRecordings, ...], FilePart, Kept, or texts by module
-    "node": object,  # tuple[PeerNodes, ...] for lists, else as node_requests.REPLIES says
-}
-
-
 def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
     """The parameters in a value, each with its name.
 
@@ -283,14 +260,6 @@ def parameters_in(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]
     return found
 
 
-def _passed_on(client: ControlClient, operation: str, kind: type[_T], **args: Any) -> _T:
-    """The answer of another agent, to which this one only passes the question on: so it refuses nothing itself."""
-    try:
-        return client.call(operation, kind, **args)
-    except PeerRefused as error:
-        raise RmpaError(error.reason, code=error.code) from None
-
-
 @dataclass(frozen=True, slots=True)
 class PeerParams:
     """The parameters of a peer's module, through both agents; each call blocks.
@@ -302,11 +271,6 @@ class PeerParams:
 
     client: ControlClient
     peer: str
-
-    @property
-    def title(self) -> str:
-        """The peer, for error texts."""
-        return self.peer
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or a namespace.
@@ -340,7 +304,7 @@ class PeerParams:
         return parse_response(param_requests.text_of(self._ask(what, **args)).encode())
 
     def _ask(self, what: str, **args: str) -> object:
-        return _passed_on(self.client, "param", dict[str, Any], peer=self.peer, what=what, **args)
+        return self.client.pass_on("param", dict[str, Any], peer=self.peer, what=what, **args)
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,11 +318,6 @@ class Ros2Params:
 
     client: ControlClient
     node: str
-
-    @property
-    def title(self) -> str:
-        """The node, for error texts."""
-        return self.node
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or those of a namespace by name; errors as for ``PeerParams``."""
@@ -380,7 +339,7 @@ class Ros2Params:
 
     def _ask(self, **args: str) -> Any:
         asked = {"site": ROS2, "node": self.node, **args}
-        text = _passed_on(self.client, "site", str, what=PARAM, args=asked)
+        text = self.client.pass_on("site", str, what=PARAM, args=asked)
         return json.loads(text) if text else None
 
 

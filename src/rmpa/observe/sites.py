@@ -37,8 +37,8 @@ _WAYS: Final = Needs(
     (Access.SUBSCRIBE, Access.CALL), "the topic or service, by its name here; what leaves is the asking module's own"
 )
 _PARAMETERS: Final = Needs((Access.CALL,), "a service of parameters of ROS 2, such as `/node/get_parameters`")
-# The questions about other sites.
-QUESTIONS: Final = (REPORT, SITE_INFO, SITE_WHY, PARAM)
+# The questions about other sites, with what each needs of a peer that asks.
+QUESTIONS: Final = {REPORT: _SOURCES, SITE_INFO: _SOURCES, SITE_WHY: _WAYS, PARAM: _PARAMETERS}
 
 
 class SiteAnswerer(Protocol):
@@ -76,11 +76,8 @@ class SiteRequests:
         def answer(what: str, asker: PeerSession, args: Args) -> Awaitable[object]:
             return gateway.answer(what, args, asker.link.name)
 
-        rpc = self._bridge.rpc
-        rpc.on_request(REPORT, partial(answer, REPORT), _SOURCES)
-        rpc.on_request(SITE_INFO, partial(answer, SITE_INFO), _SOURCES)
-        rpc.on_request(SITE_WHY, partial(answer, SITE_WHY), _WAYS)
-        rpc.on_request(PARAM, partial(answer, PARAM), _PARAMETERS)
+        for what, needs in QUESTIONS.items():
+            self._bridge.rpc.on_request(what, partial(answer, what), needs)
 
     async def answer(self, args: Args) -> Any:
         """The operation ``site``: ``what`` (one of ``QUESTIONS``) and its ``args``.
@@ -88,7 +85,7 @@ class SiteRequests:
         ``site.report`` and ``site.why`` return a list with the answers of all gateways; the others one answer.
         """
         what, inner = args.get("what"), args.get("args")
-        if what not in QUESTIONS or not isinstance(inner, dict):
+        if not isinstance(what, str) or what not in QUESTIONS or not isinstance(inner, dict):
             raise ConfigError("what", f"{what!r} is no question about sites")
         return await (self.all(what, inner) if what in {REPORT, SITE_WHY} else self.one(what, inner))
 

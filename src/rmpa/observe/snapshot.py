@@ -132,6 +132,14 @@ class AgentInfo(ModuleFacts, kw_only=True, frozen=True):
         return ModuleFacts(**{name: getattr(self, name) for name in ModuleFacts.__struct_fields__})
 
 
+# The state of a module that is heard, or refuses this one, because it is not of this mesh.
+FOREIGN: Final = "foreign"
+# The state of a module that an invitation would let in: it has no keys and this mesh is secured, or the other way.
+PENDING: Final = "pending"
+# The state of a module that was revoked and knocks again; of all others where it is this one.
+REVOKED: Final = "revoked"
+
+
 class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     """One peer of the roster.
 

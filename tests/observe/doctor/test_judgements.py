@@ -28,8 +28,7 @@ from rmpa.observe.doctor.network import (
     judge_routes,
     judge_rp_filter,
 )
-from rmpa.observe.peers import FOREIGN
-from rmpa.observe.snapshot import PeerInfo, Snapshot
+from rmpa.observe.snapshot import FOREIGN, PeerInfo, Snapshot
 from rmpa.observe.why.diagnosis import judge_peer_clock
 from rmpa.trust.permissions import TrustStatus
 from tests.observe.samples import SNAPSHOT

@@ -13,8 +13,15 @@ import pytest
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.observe import limits
-from rmpa.observe.control import GATEWAY_ROLE, ROLE, ControlReply
-from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.control_client import (
+    GATEWAY_ROLE,
+    ROLE,
+    ControlClient,
+    ControlReply,
+    choose_agent,
+    find_agents,
+    same_core,
+)
 from rmpa.observe.control_server import ControlServer, Handler
 from rmpa.observe.snapshot import PingReply, Snapshot
 from tests.observe.samples import SNAPSHOT

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import StartError
-from rmpa.observe.control import ControlReply
+from rmpa.observe.control_client import ControlReply
 from rmpa.observe.control_server import ControlServer, control_group, peer_credentials
 
 if TYPE_CHECKING:

@@ -13,12 +13,13 @@ import pytest
 
 from rmpa.core.errors import StartError
 from rmpa.observe import control_client as module
-from rmpa.observe.control_client import NameLock, make_runtime_dir, runtime_dir, runtime_dirs
+from rmpa.observe.control_client import runtime_dir, runtime_dirs
+from rmpa.observe.control_server import NameLock, make_runtime_dir
 
 HOLD = """
 import sys, signal
 from pathlib import Path
-from rmpa.observe.control_client import NameLock
+from rmpa.observe.control_server import NameLock
 lock = NameLock(Path(sys.argv[1]), "base")
 print("held", flush=True)
 sys.stdin.read()

@@ -32,8 +32,8 @@ from rmpa.core.contract import ContractRule, Contracts
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.facts import LaneInfo, RouteInfo, TopicInfo
 from rmpa.core.identity import OWN_NODE
-from rmpa.observe.peers import judge_stranger
 from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
+from rmpa.observe.snapshot_builder import judge_stranger
 from rmpa.observe.why.services import diagnose_module
 from rmpa.trust.permissions import TrustReason, TrustStatus
 from rmpa.web.hub.frame_writer import Opcode

@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import UnreachableError
-from rmpa.observe.control import ControlReply
+from rmpa.observe.control_client import ControlReply
 from rmpa.observe.control_server import ControlServer
 from rmpa.observe.graph import GraphRevision, GraphRevisions
 from rmpa.observe.snapshot import Snapshot

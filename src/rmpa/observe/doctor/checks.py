@@ -22,7 +22,8 @@ from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor import machine, network, repairs
 from rmpa.observe.why.diagnosis import judge_peer_clock, misplaced, remedy_for, subscriber_text
-from rmpa.ros.http.rpc import call_api
+from rmpa.ros.http.rpc import call
+from rmpa.ros.master.mirror import lookup_calls, read_lookups
 from rmpa.runtime.accept import open_files_advice
 from rmpa.runtime.plugins import DOCTOR_CHECKS, find_plugins, load_plugin, plugin_error
 
@@ -254,18 +255,12 @@ def exposed_nodes(core_uri: str, agent_pid: int) -> dict[str, tuple[int, ...]] |
 
 async def _slave_ports(core_uri: str) -> dict[str, int]:
     async with asyncio.timeout(limits.DOCTOR_NODES_TIMEOUT):
-        state = (await call_api(core_uri, "getSystemState", machine.CALLER)).value
-        kinds = state if isinstance(state, list) else []
-        rows = [row for kind in kinds if isinstance(kind, list) for row in kind if isinstance(row, list)]
-        names = {str(node) for row in rows if len(row) == 2 and isinstance(row[1], list) for node in row[1]}
-        own = [name for name in names if proxied_peer(name) is None and name not in _AGENTS_OWN]
-        found = {}
-        for name in sorted(own)[: limits.DOCTOR_NODES_MAX]:
-            uri = (await call_api(core_uri, "lookupNode", machine.CALLER, name)).value
-            port = urlsplit(uri).port if isinstance(uri, str) else None
-            if port:
-                found[name] = port
-        return found
+        names = (await machine.survey(core_uri)).nodes()
+        own = sorted(name for name in names if proxied_peer(name) is None and name not in _AGENTS_OWN)
+        own = own[: limits.DOCTOR_NODES_MAX]
+        answer = await call(core_uri, "system.multicall", lookup_calls(machine.CALLER, own, ()))
+        ports = {name: urlsplit(uri).port for name, uri in read_lookups(answer, own, ())[0].items()}
+        return {name: port for name, port in ports.items() if port}
 
 
 # All checks, in the order of the output; at least one result of each has its name. Each takes 2 s at most.
@@ -282,7 +277,7 @@ CHECKS: Final[dict[str, Callable[[DoctorInput], Iterable[Check]]]] = {
     "ROS": machine.shell,
     "clock": machine.clocks,
     "realtime": machine.rights,
-    "boot": machine.at_boot,
+    "boot": lambda _: [machine.judge_unit(machine.read_unit())],
     "directory": repairs.directories,
     "exposed nodes": _exposed_nodes,
 }

@@ -30,13 +30,17 @@ from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check, CheckLevel
 from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
-from rmpa.ros.http.rpc import call_api
+from rmpa.ros.http.rpc import call, call_api
+from rmpa.ros.master.mirror import read_survey, survey_calls
+from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.realtime import REMEDY
 from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from rmpa.ros.master.mirror import Survey
 
 
 # The name under which a core is asked.
@@ -212,16 +216,12 @@ async def _clock_publishers(core_uri: str) -> list[str] | None:
         used = await call_api(core_uri, "getParam", CALLER, "/use_sim_time")
         if used.code != 1 or not used.value:
             return None
-        match (await call_api(core_uri, "getSystemState", CALLER)).value:
-            case [list(publishers), *_]:
-                found = [row[1] for row in publishers if isinstance(row, list) and row[:1] == ["/clock"]]
-                return [str(node) for nodes in found if isinstance(nodes, list) for node in nodes]
-    return []
+        return [*(await survey(core_uri)).holders[RegistrationKind.PUBLISHER].get("/clock", ())]
 
 
-def at_boot(_: DoctorInput) -> Iterable[Check]:
-    """The check of the unit of ``rmpa service install``."""
-    return [judge_unit(read_unit())]
+async def survey(core_uri: str) -> Survey:
+    """The graph of a core."""
+    return read_survey(await call(core_uri, "system.multicall", survey_calls(CALLER, (), ())), (), ())
 
 
 def read_unit() -> dict[str, str]:

@@ -425,12 +425,11 @@ def _name_in(args: dict[str, Any], key: str) -> str:
 
 
 async def _probe(uri: str, service: str) -> tuple[str, str]:
-    """A server's description of its service, and why there is none; asked as ``rospy.wait_for_service`` does."""
+    """A server's description of its service, and why there is none."""
     try:
-        found = await ServiceConnection.open(uri, service, OWN_NODE, probe=True, persistent=False, timeout=2.0)
+        found = await ServiceConnection.probe(uri, service, OWN_NODE, timeout=2.0)
     except RmpaError as error:
         return "", str(error)
-    found.close()
     return f"{found.description.type}, md5 {found.description.md5sum}", ""
 
 

@@ -1,4 +1,4 @@
-"""What ``rmpa --version`` says: the release, the commit, and which formats this program speaks."""
+"""What the program tells of itself: release, commit and formats (``rmpa --version``), and the script for shells."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
+import click
+
 import rmpa
+from rmpa.cli.main import cli, verb
 
 
 def long_version() -> str:
@@ -68,3 +71,48 @@ def protocols() -> dict[str, tuple[int | str, str]]:
         for name, (module, number, about) in _FORMATS.items()
         if (Path(rmpa.__file__).parent / module.partition(".")[0]).is_dir()
     }
+
+
+_BASH: Final = """\
+%(complete_func)s() {
+    local IFS=$'\\n' line=${COMP_LINE:0:COMP_POINT} words current number reply
+    # bash takes PEER:/name for three words. These are those of the line, up to the cursor.
+    IFS=' ' read -ra words <<< "$line"
+    [[ $line == *' ' ]] && words+=('')
+    current=${words[-1]}
+    COMPREPLY=()
+    number=$((${#words[@]} - 1))
+    for reply in $(env COMP_WORDS="${words[*]}" COMP_CWORD=$number %(complete_var)s=bash_complete $1); do
+        case ${reply%%%%,*} in
+            dir) compopt -o dirnames ;;
+            file) compopt -o default ;;
+            *) reply=${reply#*,}
+               [[ $current == *:* ]] && reply=${reply#"${current%%:*}:"}
+               COMPREPLY+=("$reply") ;;
+        esac
+    done
+}
+complete -o nosort -F %(complete_func)s %(prog_name)s
+"""
+
+
+@verb(click.argument("shell", type=click.Choice(["bash", "zsh", "fish"])))
+def completion(shell: str) -> None:
+    """Print the script that completes commands, options, and the names that the agent knows, in a shell.
+
+    ---
+
+    Examples:
+      eval "$(rmpa completion bash)"             in this shell; in ~/.bashrc for all
+      rmpa completion zsh > "${fpath[1]}/_rmpa"
+      mkdir -p ~/.config/fish/completions
+      rmpa completion fish > ~/.config/fish/completions/rmpa.fish
+    """
+    from click.shell_completion import BashComplete, get_completion_class
+
+    kind = get_completion_class(shell)
+    assert kind is not None  # noqa: S101 - each of the choices has one
+    # ``source()`` of bash's class would run bash to check its version; the template needs no shell.
+    complete = kind(cli, {}, "rmpa", "_RMPA_COMPLETE")
+    template = _BASH if isinstance(complete, BashComplete) else complete.source_template
+    click.echo(template % complete.source_vars())
