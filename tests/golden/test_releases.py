@@ -34,7 +34,7 @@ from rmpa.ros.core import state as core_state
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.types.descriptor import Descriptor
-from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, ca_public_key, read_document, verify
+from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, ca_public_key, read_certificate, read_document
 from rmpa.trust.packets import Verdict
 from rmpa.trust.store import AuthorityPlace, Issued, TrustStore
 from rmpa.trust.tokens import Invitation, Token, TokenBook, decode_message
@@ -48,7 +48,6 @@ from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver
 from tests.observe.samples import SNAPSHOT
 from tests.resource import test_saved
 from tests.trust import test_packets, test_tokens
-from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
 if TYPE_CHECKING:
@@ -213,7 +212,7 @@ def check_state(place: Path) -> None:
     store = TrustStore(place, MODULE)
     files = store.load()
     authority = ca_public_key(files.ca)
-    assert verify(files.certificate, files.ca, WALL).name == MODULE
+    assert read_certificate(files.certificate, files.ca).name == MODULE
     assert read_document(files.keys, authority, KeyList) == KEYS
     assert read_document(files.deny, authority, DenyList) == DENIED
     assert store.load_tokens().invitations == (INVITED,)

@@ -211,7 +211,7 @@ class CertificateRequest:
 
 @dataclass(frozen=True, slots=True)
 class ModuleCertificate:
-    """What a module's certificate says, once it was verified.
+    """What a module's certificate says, which the CA has signed.
 
     Args:
         name: The module's.
@@ -235,7 +235,17 @@ class ModuleCertificate:
         return self.issued + (self.expires - self.issued) * limits.RENEWAL_SHARE
 
     def judge(self, wall: float | None, name: str = "", deny: DenyList | None = None, grace: float = 0.0) -> None:
-        """Check times, name and revocation; arguments and errors as for ``verify``."""
+        """Check times, name and revocation.
+
+        Args:
+            wall: Seconds since 1970; ``None`` checks no times, for a module whose clock is not set.
+            name: The module that it must be of; empty for any.
+            deny: The names that were revoked.
+            grace: Seconds for which an expired certificate is still accepted, to be renewed.
+
+        Raises:
+            TrustError: It is not valid yet, expired, of another module, or revoked; the first of these.
+        """
         begin = self.issued - limits.CERTIFICATE_BACKDATE
         if wall is not None and wall < begin:
             text = f"the certificate of {self.name} begins in {begin - wall:.0f} s: one of the clocks is off"
@@ -373,30 +383,16 @@ def read_request(data: bytes) -> CertificateRequest:
     return CertificateRequest(name, _public_bytes(key), hosts)
 
 
-def verify(
-    data: bytes, ca: bytes, wall: float | None, *, name: str = "", deny: DenyList | None = None, grace: float = 0.0
-) -> ModuleCertificate:
-    """Verify a module's certificate.
+def read_certificate(data: bytes, ca: bytes) -> ModuleCertificate:
+    """Read a module's certificate; whether it holds now, its ``judge`` says.
 
     Args:
         data: The certificate (DER).
         ca: The CA's (DER), which this module trusts.
-        wall: Seconds since 1970; ``None`` checks no times, for a new module whose clock is not set.
-        name: The module that it must be of; empty for any.
-        deny: The names that were revoked.
-        grace: Seconds for which an expired certificate is still accepted, to be renewed.
 
     Raises:
-        TrustError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of
-            these.
+        TrustError: It is too long, malformed, of another CA, or not one of a module.
     """
-    found = _read(data, ca)
-    found.judge(wall, name, deny, grace)
-    return found
-
-
-def _read(data: bytes, ca: bytes) -> ModuleCertificate:
-    """What a certificate says, if the CA has signed it for a module."""
     if len(data) > limits.CERTIFICATE_MAX:
         raise TrustError(TrustReason.FOREIGN, f"a certificate of {len(data)} bytes")
     authority = x509.load_der_x509_certificate(ca)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.trust import certificates, limits, tokens
-from rmpa.trust.certificates import DenyList, KeyList, read_document
+from rmpa.trust.certificates import DenyList, KeyList, read_certificate, read_document
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, CERTIFICATE, KEY, MemberFiles, join_context, member_context
@@ -257,7 +257,7 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
     grant, server = await _ask(str(token.address), token.port, join_context(), question)
     try:
         certificates.check_ca(grant.ca, token.fingerprint)
-        certificates.verify(server, grant.ca, None)
+        read_certificate(server, grant.ca)
         check_grant(grant, name, request)
     except TrustError as error:
         raise _refused(error.reason.label, str(error)) from None
@@ -271,7 +271,8 @@ def check_grant(grant: tokens.CertificateGrant, name: str, request: bytes) -> No
         TrustError: The certificate is of another CA, module or key.
         RemoteProtocolError: A document is malformed, or not signed by the CA.
     """
-    found = certificates.verify(grant.certificate, grant.ca, None, name=name)
+    found = read_certificate(grant.certificate, grant.ca)
+    found.judge(None, name)
     if found.public_key != certificates.read_request(request).public_key:
         raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
     key = certificates.ca_public_key(grant.ca)
@@ -286,7 +287,7 @@ async def renew_at_authority(membership: Membership, address: str, port: int) ->
     files = store.path(CERTIFICATE), store.path(KEY)
 
     def question(server: bytes) -> tokens.Renew:
-        name = certificates.verify(server, membership.files.ca, None).name
+        name = membership.read_member(server).name
         if name != membership.keys.authority:
             raise RemoteProtocolError(f"the module at {address}:{port} is {name}, not the authority")
         return tokens.Renew(membership.request())

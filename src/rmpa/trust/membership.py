@@ -10,7 +10,7 @@ import logging
 import os
 import ssl
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 from cryptography.hazmat.primitives import serialization
@@ -19,7 +19,15 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, StartError
 from rmpa.trust import certificates, limits
-from rmpa.trust.certificates import CURVE, DenyList, KeyList, ModuleCertificate, read_document, sign
+from rmpa.trust.certificates import (
+    CURVE,
+    DenyList,
+    KeyList,
+    ModuleCertificate,
+    read_certificate,
+    read_document,
+    sign,
+)
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import Document, TrustError, TrustReason, server_names
 from rmpa.trust.store import (
@@ -38,7 +46,7 @@ from rmpa.trust.store import (
 from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from ipaddress import IPv4Address
 
     from rmpa.runtime.loop import SystemClock
@@ -100,7 +108,7 @@ class Membership:
         self._machine_wall = wall
         with _named(store, CERTIFICATE):
             self._ca_key = certificates.ca_public_key(files.ca)
-            self.certificate = certificates.verify(files.certificate, files.ca, None)
+            self.certificate = read_certificate(files.certificate, files.ca)
         with _named(store, KEYS):
             # The list of group keys that holds.
             self.keys = read_document(files.keys, self._ca_key, KeyList)
@@ -143,23 +151,23 @@ class Membership:
         wall = self._machine_wall()
         return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
 
-    def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
-        """Check the other end's certificate behind a TLS handshake, which has checked the chain.
-
-        Args:
-            certificate: As ``SSLObject.getpeercert()`` returns it, or in DER; its chain is then verified here.
-            claimed: The name in its hello; ``None``: not known yet.
+    def read_member(self, certificate: bytes | None) -> ModuleCertificate:
+        """What the certificate (DER) of another module says, if it is one of this mesh.
 
         Raises:
-            TrustError: It is malformed (``foreign``), not valid yet (``clock``), ``expired``, of another module
-                (``name``), or ``revoked``.
+            TrustError: There is none, or it is of another CA (``foreign``).
         """
-        if isinstance(certificate, bytes | bytearray):
-            certificates.verify(bytes(certificate), self.files.ca, self.wall(), name=claimed or "", deny=self.deny)
-            return
-        name, begin, expires = member_name(certificate), *_times(certificate)
-        found = ModuleCertificate(name, 0, begin + limits.CERTIFICATE_BACKDATE, expires, b"")
-        found.judge(self.wall(), claimed or "", self.deny)
+        if certificate is None:
+            raise TrustError(TrustReason.FOREIGN, "it has no certificate")
+        return read_certificate(certificate, self.files.ca)
+
+    def judge_member(self, certificate: ModuleCertificate, claimed: str | None) -> None:
+        """Check the certificate of another module; ``claimed`` is the name in its hello, if that is known.
+
+        Raises:
+            TrustError: It is not valid yet (``clock``), ``expired``, of another module (``name``), or ``revoked``.
+        """
+        certificate.judge(self.wall(), claimed or "", self.deny)
 
     def request(self, hosts: Iterable[str] = ()) -> bytes:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
@@ -209,7 +217,8 @@ class Membership:
             TrustError: It is of another CA, another module, another key, or not valid now.
             StartError: It cannot be written; the one before goes on.
         """
-        found = certificates.verify(certificate, self.files.ca, self.wall(), name=self.name)
+        found = read_certificate(certificate, self.files.ca)
+        found.judge(self.wall(), self.name)
         if found.public_key != self.certificate.public_key:
             raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
         self.store.write(CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
@@ -227,32 +236,6 @@ class Membership:
         joins = [ALPN_JOIN] if self.store.is_authority else []
         self.server_context = member_context(*files, ca, ALPN_LINK, *joins, server_side=True)
         self.client_context = member_context(*files, ca, ALPN_LINK, server_side=False)
-
-
-def member_name(certificate: Mapping[str, Any]) -> str:
-    """The module that a certificate is of.
-
-    Args:
-        certificate: As ``SSLObject.getpeercert()`` returns it.
-
-    Raises:
-        TrustError: It is not one of a module.
-    """
-    if not certificate:
-        raise TrustError(TrustReason.FOREIGN, "it has no certificate")
-    uris = [value for kind, value in certificate.get("subjectAltName", ()) if kind == "URI"]
-    if len(uris) != 1 or not uris[0].startswith(certificates.URN):
-        raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a module")
-    return str(uris[0].removeprefix(certificates.URN))
-
-
-def _times(certificate: Mapping[str, Any]) -> tuple[float, float]:
-    """Begin and end of a certificate, seconds since 1970."""
-    try:
-        begin, end = (ssl.cert_time_to_seconds(certificate[key]) for key in ("notBefore", "notAfter"))
-    except (KeyError, ValueError):
-        raise TrustError(TrustReason.FOREIGN, "the certificate has no validity") from None
-    return float(begin), float(end)
 
 
 @contextlib.contextmanager
@@ -417,10 +400,9 @@ class MeshAuthority:
         Raises:
             TrustError: It is of another CA, ended too long ago, or was revoked.
         """
-        member = self.membership
-        return certificates.verify(
-            certificate, member.files.ca, self.wall(), deny=member.deny, grace=limits.RENEWAL_GRACE
-        )
+        found = self.membership.read_member(certificate)
+        found.judge(self.wall(), deny=self.membership.deny, grace=limits.RENEWAL_GRACE)
+        return found
 
     def renew_own(self, hosts: Iterable[str] = ()) -> None:
         """Renew the certificate of the authority itself, with these hosts of its page; raises as ``issue``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -21,15 +20,13 @@ from rmpa.core.errors import (
     StartError,
     UnreachableError,
 )
-from rmpa.core.log import RefusalLog
+from rmpa.core.identity import Guid, Identity
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
-from rmpa.mesh.io.securing import Securing
-from rmpa.runtime.accept import Acceptor, Use
-from rmpa.runtime.loop import SystemClock
-from rmpa.trust import certificates
+from rmpa.mesh.io.link import LinkHandlers
+from rmpa.mesh.io.mesh import Mesh
 from rmpa.trust import store as files_of
-from rmpa.trust.certificates import DenyList, make_request
+from rmpa.trust.certificates import DenyList, make_request, read_certificate
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
 from rmpa.trust.membership import (
     Membership,
@@ -89,23 +86,15 @@ async def running(lab: Lab) -> AsyncIterator[Lab]:
     """The authority's port, as its mesh has it."""
     listener = socket.create_server(("127.0.0.1", 0))
     lab.port = listener.getsockname()[1]
-    securing = Securing(
-        lab.base,
-        clock=SystemClock(),
-        refusals=RefusalLog(logging.getLogger(__name__), Counters()),
-        on_secured=lambda sock, *_: sock.close(),
-        on_refused=lambda *_: None,
-        on_join=lab.server.serve,
-        pause=lambda _: None,
-    )
-    acceptor = Acceptor(listener, securing.accept, name="joins", use=Use.LINK)
-    acceptor.start()
+    identity = Identity(Guid.of("127.0.0.1", lab.port, 1), b"b" * 16, "base")
+    nothing = LinkHandlers(*[lambda *_: None] * 6)
+    mesh = Mesh(identity, listener, nothing, security=lab.base, on_join=lab.server.serve)
+    await mesh.start()
     try:
         async with asyncio.timeout(DEADLINE):
             yield lab
     finally:
-        acceptor.close()
-        await securing.close()
+        await mesh.close()
 
 
 @pytest.fixture
@@ -119,8 +108,8 @@ async def test_a_module_joins_with_its_token(lab: Lab) -> None:
         assert lab.server.step(token.token_id).state == "waiting"
         arm = lab.member(await lab.join(token))
     assert arm.name == "arm"
-    lab.base.judge_member(arm.files.certificate, "arm")
-    arm.judge_member(lab.base.files.certificate, "base")
+    lab.base.judge_member(lab.base.read_member(arm.files.certificate), "arm")
+    arm.judge_member(arm.read_member(lab.base.files.certificate), "base")
     step = lab.server.step(token.token_id)
     assert (step.step, step.state, step.module) == (1, "joined", "arm")
     assert [each.name for each in lab.authority.issued] == ["arm", "base"]
@@ -229,7 +218,7 @@ async def test_a_module_that_was_in_a_drawer_asks_again_with_its_key(lab: Lab) -
         lab.authority.renew_own()
         lab.authority.rotate()
         await renew_at_authority(arm, "127.0.0.1", lab.port)
-        lab.base.judge_member(arm.files.certificate, "arm")
+        lab.base.judge_member(lab.base.read_member(arm.files.certificate), "arm")
         assert arm.ring.newest == lab.base.ring.newest
 
 
@@ -286,7 +275,7 @@ async def test_a_revocation_holds_also_if_the_clock_went_back(lab: Lab, again: b
         lab.authority.revoke("arm")
         lab.clock.wall_seconds += DAY / 2
         with pytest.raises(TrustError, match="arm was revoked"):
-            lab.base.judge_member(arm.files.certificate, "arm")
+            lab.base.judge_member(lab.base.read_member(arm.files.certificate), "arm")
 
 
 async def test_the_deny_list_names_the_members_while_a_revoked_certificate_may_be_valid(lab: Lab) -> None:
@@ -368,7 +357,7 @@ async def test_a_module_joins_whatever_its_clock_shows(lab: Lab, wall: float) ->
     arm = Membership.load(store, clock, clock.wall)
     assert (arm.wall() is None) == (wall < WALL)
     if arm.wall() is None:
-        arm.judge_member(lab.base.files.certificate, "base")
+        arm.judge_member(arm.read_member(lab.base.files.certificate), "base")
 
 
 async def test_the_text_of_a_refused_renewal_is_safe_to_show(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,7 +407,7 @@ def test_a_join_by_files(lab: Lab) -> None:
     assert request_der(request_pem(request)) == request
     asked, answer = lab.authority.join_file(request)
     assert asked.name == "arm"
-    assert certificates.verify(answer.certificate, answer.ca, WALL).name == "arm"
+    assert read_certificate(answer.certificate, answer.ca).name == "arm"
     assert "kkkk" not in repr(answer)
     with pytest.raises(ConfigError, match=r"a module named arm is a member.*: --module arm; else rmpa trust revoke"):
         lab.authority.join_file(request)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -33,20 +33,24 @@ def mesh(tmp_path: Path) -> SecuredMesh:
     return SecuredMesh(tmp_path)
 
 
-def reason_of(member: Membership, certificate: dict[str, Any] | bytes, claimed: str | None) -> TrustReason:
+def judge(member: Membership, certificate: bytes | None, claimed: str | None) -> None:
+    member.judge_member(member.read_member(certificate), claimed)
+
+
+def reason_of(member: Membership, certificate: bytes | None, claimed: str | None) -> TrustReason:
     with pytest.raises(TrustError) as caught:
-        member.judge_member(certificate, claimed)
+        judge(member, certificate, claimed)
     return caught.value.reason
 
 
-def test_certificates_are_judged_in_both_forms(mesh: SecuredMesh, tmp_path: Path) -> None:
+def test_certificates_of_others_are_judged(mesh: SecuredMesh, tmp_path: Path) -> None:
     base = mesh.member("base")
     certificate = mesh.authority.module("arm")
-    base.judge_member(certificate, "arm")
-    base.judge_member(certificate, None)
+    judge(base, certificate, "arm")
+    judge(base, certificate, None)
     assert reason_of(base, certificate, "joystick") is TrustReason.NAME
     assert reason_of(base, SecuredMesh(tmp_path).authority.module("arm"), "arm") is TrustReason.FOREIGN
-    assert reason_of(base, {"notBefore": "x"}, None) is reason_of(base, {}, None) is TrustReason.FOREIGN
+    assert reason_of(base, b"nonsense", None) is reason_of(base, None, None) is TrustReason.FOREIGN
     mesh.clock.wall_seconds = WALL + 8 * DAY
     assert reason_of(base, certificate, "arm") is TrustReason.EXPIRED
     late = mesh.authority.module("arm", WALL + 9 * DAY)
@@ -58,7 +62,7 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     begin = WALL - limits.CERTIFICATE_BACKDATE
     mesh.clock.wall_seconds = begin - 1
     assert base.wall() is None
-    base.judge_member(mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
+    judge(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
     mesh.clock.wall_seconds = begin + 1
     assert base.wall() == begin + 1
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
@@ -75,7 +79,7 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
     assert called == [1]
     assert base.document(Document.DENY) == newer
     assert reason_of(base, certificate, "arm") is TrustReason.REVOKED
-    base.judge_member(mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
+    judge(base, mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
     again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED
     mesh.clock.wall_seconds = 0.0
@@ -204,12 +208,6 @@ def shake(dialler: Membership, acceptor: Membership) -> tuple[ssl.SSLObject, ssl
     return client.tls, server.tls
 
 
-def seen_by(tls: ssl.SSLObject) -> dict[str, Any]:
-    found = tls.getpeercert()
-    assert found
-    return dict(found)
-
-
 def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None:
     arm, base = mesh.member("arm"), mesh.member("base")
     # OpenSSL judges times by this machine's clock; the test's certificates are of another year.
@@ -218,6 +216,6 @@ def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None
     mesh.clock.wall_seconds = WALL
     assert at_arm.version() == "TLSv1.3"
     assert at_arm.selected_alpn_protocol() == at_base.selected_alpn_protocol() == "rmpa/1"
-    arm.judge_member(seen_by(at_arm), "base")
-    base.judge_member(seen_by(at_base), "arm")
-    assert reason_of(base, seen_by(at_base), "joystick") is TrustReason.NAME
+    judge(arm, at_arm.getpeercert(binary_form=True), "base")
+    judge(base, at_base.getpeercert(binary_form=True), "arm")
+    assert reason_of(base, at_base.getpeercert(binary_form=True), "joystick") is TrustReason.NAME

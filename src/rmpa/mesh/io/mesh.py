@@ -17,7 +17,7 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.dial import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
-from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
+from rmpa.mesh.io.securing import Securing, SecuringError
 from rmpa.mesh.keepalive import Pace, rest_lease
 from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
@@ -87,29 +87,17 @@ class Mesh:
     ) -> None:
         self.identity, self.handlers, self.rng = identity, handlers, rng
         self.clock, self.counters, self.pace = clock or SystemClock(), Counters(), Pace.of(identity)
-        self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
-        self._refusals = RefusalLog(_log, self.counters)
+        self.acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
+        self.refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
-        self._peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
-        self._timer = MachineTimer(self._peering.next_timer, self._due, now=self.clock.now)
+        self.peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
+        self._timer = MachineTimer(self.peering.next_timer, self._due, now=self.clock.now)
         self._connections: dict[int, Connection] = {}
         # The links, by the id of the express lane's connection.
         self._links: dict[int, PeerLink] = {}
         # The dials that are under way.
         self._tasks = OwnedTasks()
-        self._security = security
-        self._securing: Securing | None = None
-        if security is not None:
-            self._securing = Securing(
-                security,
-                clock=self.clock,
-                refusals=self._refusals,
-                on_secured=self._secured,
-                on_refused=self._peering.refused_from,
-                on_join=on_join,
-                pause=self._acceptor.pause,
-            )
-            security.on_denied.append(self._denied)
+        self._securing = None if security is None else Securing(self, security, on_join)
         self._ids = count(1)
         self._acting = False
         self._running = False
@@ -117,7 +105,7 @@ class Mesh:
     async def start(self) -> None:
         """Begin to accept and to dial; peers may have been found before."""
         self._running = True
-        self._acceptor.start()
+        self.acceptor.start()
         self._act()
 
     async def close(self, *, moves: bool = False) -> None:
@@ -127,13 +115,11 @@ class Mesh:
             moves: Whether this agent is back at once, at another address: the address of some connections may be gone
                 already, so that their byes have no answer, and are not waited for.
         """
-        self._acceptor.close()
+        self.acceptor.close()
         if not self._running:
             return
         self._running = False
         self._timer.close()
-        if self._security is not None:
-            self._security.on_denied.remove(self._denied)
         if self._securing is not None:
             await self._securing.close()
         await self._tasks.close()
@@ -152,17 +138,17 @@ class Mesh:
             identity: The peer; its addresses are dialled in turn.
             source: The source address of the peer's own beacon, which is dialled first.
         """
-        self._peering.peer_found(identity, self.clock.now(), source)
+        self.peering.peer_found(identity, self.clock.now(), source)
         self._act()
 
     def peer_gone(self, guid: Guid) -> None:
         """Stop dialling a peer that discovery has given up; a link that is up stays."""
-        self._peering.peer_gone(guid)
+        self.peering.peer_gone(guid)
         self._act()
 
     def notes(self) -> tuple[str, ...]:
         """Problems of this module in the mesh, as texts for the user."""
-        return (FULL.text,) if self._peering.left_out else ()
+        return (FULL.text,) if self.peering.left_out else ()
 
     def count_peers(self, peers: int) -> None:
         """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
@@ -170,7 +156,7 @@ class Mesh:
 
     def peers(self) -> list[Peer]:
         """All known peers: linked, or why not and when the next attempt is due."""
-        return self._peering.peers()
+        return self.peering.peers()
 
     def connections(self) -> list[Connection]:
         """All connections, those without a handshake too."""
@@ -186,10 +172,10 @@ class Mesh:
 
     def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello or welcome of the remote side; the peering machine knows the links that are up."""
-        refuse = self._prove(connection, hello)
+        refuse = None if self._securing is None else self._securing.prove(connection, hello)
         if refuse is not None or connection.dialled:
             return refuse
-        refuse = self._peering.judge(hello, self.clock.now())
+        refuse = self.peering.judge(hello, self.clock.now())
         if refuse is not None and refuse.code == Refusal.DUPLICATE:
             for link in self.links():
                 if link.guid.place == hello.guid.place and link.rests:
@@ -198,22 +184,13 @@ class Mesh:
                     return Refuse(Refusal.ALREADY_LINKED, "the link of your former run is being checked; dial again")
         return refuse
 
-    def _prove(self, connection: Connection, hello: Hello) -> Refuse | None:
-        """Compare a hello with the certificate, and with the names of the links that it would replace or join."""
-        if self._security is None or connection.certificate is None:
-            return None
-        linked = [(link.identity, link.alive) for link in self.links()]
-        others = (each.remote for each in self.connections() if each.up and each is not connection)
-        named = sum(other is not None and other.name == hello.name for other in others)
-        return prove(hello, connection.certificate, self._security, linked, named)
-
     def opened(self, connection: Connection) -> None:
         """Make a link of a connection whose handshake succeeded, or the bulk lane of one."""
         connection.expected = None
         if connection.lane != Lane.BULK:
             link = self._links[connection.id] = PeerLink(connection, self)
             now, endpoint = self.clock.now(), link.remote_endpoint
-            self._peering.link_up(link.id, link.identity, now, dialled=link.dialled, endpoint=endpoint)
+            self.peering.link_up(link.id, link.identity, now, dialled=link.dialled, endpoint=endpoint)
             self._act()
             return
         there = (link for link in self.links() if link.guid.place == connection.identity.guid.place)
@@ -231,7 +208,7 @@ class Mesh:
         ordinary, kind = refuse.code in _ORDINARY, f"link.refused.{refuse.label}"
         if by_us and not ordinary:
             text = f"refused a link with {connection.name} at {address}: {refuse.text}"
-            self._refusals.refuse(now, kind, address, text)
+            self.refusals.refuse(now, kind, address, text)
         elif ordinary or refuse.code in _TRUST:
             self.counters.add(kind)
             _log.debug("! %s: %s", connection.name, refuse)
@@ -239,7 +216,7 @@ class Mesh:
             self._distrusted(connection, refuse, by_us=by_us)
         if connection.lane != Lane.BULK and connection.expected is not None:
             guid, connection.expected = connection.expected, None
-            self._peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
+            self.peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
             self._act()
 
     def _distrusted(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
@@ -249,17 +226,17 @@ class Mesh:
         link = self._links.get(connection.id)
         if link is not None and link.used:
             # Not when its socket is closed: a revoked peer need not answer the refusal.
-            self._peering.link_down(link.id, str(refuse), self.clock.now())
+            self.peering.link_down(link.id, str(refuse), self.clock.now())
             self._act()
         if connection.remote is not None:
-            self._peering.link_refused(connection.remote.guid, refuse)
+            self.peering.link_refused(connection.remote.guid, refuse)
 
     def ended(self, connection: Connection, reason: str) -> None:
         """Handle the end of a connection: of a dial, of a link, or of a bulk lane, without which the link goes on."""
         now = self.clock.now()
         del self._connections[connection.id]
         if connection.malformed:
-            self._refusals.refuse(now, "link.malformed", connection.remote_endpoint[0], reason)
+            self.refusals.refuse(now, "link.malformed", connection.remote_endpoint[0], reason)
         elif connection.since is None and not connection.dialled:
             self.counters.add("link.unfinished")
             _log.debug("! %s: %s", connection.name, reason)
@@ -267,12 +244,12 @@ class Mesh:
             self._bulk_ended(connection, reason)
             return
         if connection.expected is not None:
-            self._peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
+            self.peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
         if (link := self._links.get(connection.id)) is not None:
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
-            self._peering.link_down(link.id, reason, now, silent=connection.silent, needed=needed)
+            self.peering.link_down(link.id, reason, now, silent=connection.silent, needed=needed)
         self._act()
         self._links.pop(connection.id, None)
 
@@ -294,7 +271,7 @@ class Mesh:
             return
         self._acting = True
         try:
-            while outputs := self._peering.take():
+            while outputs := self.peering.take():
                 for output in outputs:
                     self._do(output)
         finally:
@@ -326,7 +303,7 @@ class Mesh:
                 _log_refusal(identity, refuse)
 
     def _due(self, now: float) -> None:
-        self._peering.handle_timer(now)
+        self.peering.handle_timer(now)
         self._act()
 
     async def _dial(self, guid: Guid, endpoints: tuple[SocketAddress, ...], *, briefly: bool) -> None:
@@ -338,15 +315,15 @@ class Mesh:
             secured = await self._secure(sock)
         except SecuringError as error:
             self.counters.add(f"link.refused.{error.refuse.label}")
-            self._peering.dial_refused(guid, error.refuse, self.clock.now(), endpoint, proved=error.by_us)
+            self.peering.dial_refused(guid, error.refuse, self.clock.now(), endpoint, proved=error.by_us)
         except OSError as error:
             self.counters.add("link.dial_failed")
             within = limits.REDIAL_TIMEOUT if briefly else limits.DIAL_TIMEOUT
             problem = os.strerror(error.errno) if error.errno else f"no answer within {within:g} s"
             text = f"{places}: {problem}" if endpoint is None else f"{endpoint[0]}:{endpoint[1]}: {error}"
-            self._peering.dial_failed(guid, text, self.clock.now(), endpoint)
+            self.peering.dial_failed(guid, text, self.clock.now(), endpoint)
         else:
-            if self._peering.dial_opened(guid, self.clock.now()):
+            if self.peering.dial_opened(guid, self.clock.now()):
                 self._open(sock, endpoint, expected=guid, secured=secured)
             else:
                 sock.close()
@@ -360,7 +337,7 @@ class Mesh:
     async def _redial(self, link: PeerLink) -> None:
         """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
         while link.is_silent():
-            endpoints = list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
+            endpoints = list(dict.fromkeys([link.remote_endpoint, *self.peering.endpoints(link.guid)]))
             try:
                 sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
                 if not link.is_silent() or not link.connection.stream.unacknowledged:
@@ -397,10 +374,10 @@ class Mesh:
 
     async def _secure(self, sock: socket.socket) -> SecuredSocket | None:
         """Do the TLS handshake of a dialled connection in a secured mesh; closes the socket if it fails."""
-        if self._security is None:
+        if self._securing is None:
             return None
         try:
-            return await secure_dialled(sock, self._security)
+            return await self._securing.dialled(sock)
         except BaseException:
             sock.close()
             raise
@@ -428,9 +405,10 @@ class Mesh:
         if self._securing is not None:
             self._securing.accept(sock, address)
         else:
-            self._secured(sock, address, None)
+            self.secured(sock, address, None)
 
-    def _secured(self, sock: socket.socket, address: SocketAddress, secured: SecuredSocket | None) -> None:
+    def secured(self, sock: socket.socket, address: SocketAddress, secured: SecuredSocket | None) -> None:
+        """Begin the handshake of an accepted connection, which is secured where the mesh is."""
         host = address[0]
         pending = [c.remote_endpoint[0] for c in self.connections() if c.since is None and not c.dialled]
         there = pending.count(host)
@@ -440,15 +418,7 @@ class Mesh:
         else:
             sock.close()
             text = f"closed a connection from {host}: too many have not said who they are ({there} from there)"
-            self._refusals.refuse(self.clock.now(), "link.pending_full", host, text)
-
-    def _denied(self) -> None:
-        """End the links whose peers are on the new deny list."""
-        for connection in self.connections():
-            remote = connection.remote
-            if connection.up and remote is not None and (refuse := self._prove(connection, remote)):
-                connection.refuse(refuse, self.clock.now())
-                connection.flush()
+            self.refusals.refuse(self.clock.now(), "link.pending_full", host, text)
 
 
 def _is_over(task: asyncio.Task[None] | None) -> bool:
