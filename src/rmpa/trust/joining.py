@@ -126,23 +126,22 @@ class JoinServer:
 
     def _join(self, asked: tokens.Join, host: str) -> tokens.CertificateGrant | tokens.JoinRefused:
         """Let a module join: its token is used, also after a crash, before a certificate is issued."""
-        book, authority = self._authority.book, self._authority
-        name = certificates.read_request(asked.request).name
-        invitation = book.find(asked.token)
-        problem = book.judge(asked.token, name, authority.wall())
-        # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
-        server = self._authority.membership.files.certificate
-        proof = tokens.proof_of(invitation.key if invitation is not None else b"", asked.request, server)
-        if problem:
+        authority, name = self._authority, certificates.read_request(asked.request).name
+        invitation = authority.invitations.get(asked.token)
+        problem = "token" if invitation is None else invitation.problem(name, authority.wall())
+        if invitation is None or problem:
+            # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
             refused = tokens.JoinRefused(problem, f"{name} cannot join: the token {tokens.TOKEN_PROBLEMS[problem]}")
-        elif not hmac.compare_digest(proof, asked.proof):
+        elif not hmac.compare_digest(
+            tokens.proof_of(invitation.key, asked.request, authority.membership.files.certificate), asked.proof
+        ):
             refused = tokens.JoinRefused("token", "the request is not signed with the token's key")
-        elif self._is_linked(name) or authority.has_issued(name, invitation.name if invitation is not None else ""):
+        elif self._is_linked(name) or authority.has_issued(name, invitation.name):
             refused = tokens.JoinRefused(
                 "taken", f"a module named {name} is a member: choose another --name, or revoke it"
             )
         else:
-            book.use(asked.token, name, authority.wall())
+            invitation.used_by, invitation.key = name, b""
             authority.save_tokens()
             grant = authority.grant(asked.request)
             self._step(asked.token, "joined", name)
@@ -350,7 +349,7 @@ def status_of(
                 name=each.name,
                 used_by=each.used_by,
             )
-            for each in (authority.book.invitations if authority is not None else ())
+            for each in (authority.invitations.values() if authority is not None else ())
         ),
         problems=problems_of(membership, name),
     )

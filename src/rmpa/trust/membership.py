@@ -18,6 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, StartError
+from rmpa.core.identity import peer_name_problem
 from rmpa.trust import certificates, limits
 from rmpa.trust.certificates import (
     CURVE,
@@ -43,7 +44,7 @@ from rmpa.trust.store import (
     member_context,
     unusable,
 )
-from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
+from rmpa.trust.tokens import CertificateGrant, Invitation, Token, fingerprint_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -120,8 +121,6 @@ class Membership:
         self.packets = PacketTrust(self.ring, self.wall)
         # Called after a newer deny list holds: links that match end at once.
         self.on_denied: list[Callable[[], None]] = []
-        # Writes one file of the store.
-        self.save: Callable[[str, bytes], None] = store.write
         self._make_contexts()
 
     @classmethod
@@ -198,7 +197,7 @@ class Membership:
             self.keys, self.files = keys, replace(self.files, keys=data)
             self.ring.take(keys.keys, self._clock.now(), proves_from=keys.proves_from, age=self._age(keys, 0.0))
         try:
-            self.save(DENY if kind is Document.DENY else KEYS, data)
+            self.store.write(DENY if kind is Document.DENY else KEYS, data)
         except StartError as error:
             _log.error("! %s [%s]", error, error.code)
         return True
@@ -293,8 +292,8 @@ class MeshAuthority:
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
             raise unusable(store.path(CA_KEY), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
-        # The tokens.
-        self.book = store.load_tokens()
+        # The tokens, by their ids: each lets one module join once.
+        self.invitations = {each.token_id: each for each in store.load_tokens()}
 
     @property
     def issued(self) -> tuple[Issued, ...]:
@@ -308,28 +307,41 @@ class MeshAuthority:
             address: Where the joining module reaches this one.
             port: The mesh port.
             lifetime: Seconds of its validity.
-            name: The module that it is for; empty for any.
+            name: The module that it is for, whose open tokens it replaces; empty for any.
 
         Raises:
             StartError: The clock is not set, or the file cannot be written.
             ValueError: No module can have that name, or nothing can be reached at the address.
         """
-        secret = os.urandom(limits.TOKEN_SECRET_BYTES)
+        if name and (problem := peer_name_problem(name)):
+            raise ValueError(problem)
+        secret, known = os.urandom(limits.TOKEN_SECRET_BYTES), self.invitations
         token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self.membership.files.ca), secret)
-        self.book.invite(token, name)
+        self._end_open(name)
+        while len(known) >= limits.TOKENS_MAX:
+            del known[min(known, key=lambda each: (not known[each].used_by, known[each].expires))]
+        known[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)
         self.save_tokens()
         return token
 
+    def _end_open(self, name: str) -> None:
+        """Forget the tokens for a module, not for any, that were not used."""
+        for each in tuple(self.invitations.values()):
+            if name and each.name == name and not each.used_by:
+                del self.invitations[each.token_id]
+
     def withdraw(self, token_id: bytes) -> bool:
         """Make a token that was not used void; return whether there was one."""
-        withdrawn = self.book.withdraw(token_id)
-        if withdrawn:
-            self.save_tokens()
-        return withdrawn
+        invitation = self.invitations.get(token_id)
+        if invitation is None or invitation.used_by:
+            return False
+        del self.invitations[token_id]
+        self.save_tokens()
+        return True
 
     def save_tokens(self) -> None:
         """Write the tokens, one of which was used."""
-        self._store.save_tokens(self.book)
+        self._store.save_tokens(self.invitations.values())
 
     def wall(self) -> float:
         """Seconds since 1970.
@@ -483,11 +495,9 @@ class MeshAuthority:
         self._issued.pop(name, None)
         deny = self._publish(deny)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
-        unused = [each for each in self.book.invitations if not each.used_by]
-        for invitation in unused:
-            if invitation.name == name:
-                self.book.withdraw(invitation.token_id)
-        if open_to_all := sum(not each.name and each.expires > self.wall() for each in unused):
+        self._end_open(name)
+        left, wall = self.invitations.values(), self.wall()
+        if open_to_all := sum(not (each.used_by or each.name) and each.expires > wall for each in left):
             _log.warning(
                 "! %d unused tokens are for any name: %s can join again with one of them [member-revoked]",
                 open_to_all,

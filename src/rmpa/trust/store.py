@@ -21,7 +21,7 @@ import msgspec
 from rmpa.config.module_name import GATEWAY_SUFFIX, as_owner, module_dir, other_state_dirs
 from rmpa.core.errors import StartError
 from rmpa.trust import limits
-from rmpa.trust.tokens import Invitation, TokenBook
+from rmpa.trust.tokens import Invitation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -165,24 +165,23 @@ class TrustStore:
         """The CA's private key (PEM); raises as ``load``."""
         return self._read(CA_KEY, "only a copy brings it back; without one make a new mesh: rmpa trust init")
 
-    def load_tokens(self) -> TokenBook:
+    def load_tokens(self) -> list[Invitation]:
         """The tokens of the authority; none if the file is missing.
 
         Raises:
             StartError: The file cannot be read or is broken.
         """
         if not _is_there(self.path(TOKENS)):
-            return TokenBook()
+            return []
         remedy = "remove it: open tokens are then void"
         try:
-            invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
+            return msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise unusable(self.path(TOKENS), f"is broken: {error!s:.200}", remedy) from None
-        return TokenBook(invitations)
 
-    def save_tokens(self, book: TokenBook) -> None:
+    def save_tokens(self, invitations: Iterable[Invitation]) -> None:
         """Write the tokens of the authority; raises as ``save``."""
-        self.write(TOKENS, msgspec.json.encode(book.invitations))
+        self.write(TOKENS, msgspec.json.encode(list(invitations)))
 
     def load_issued(self) -> dict[str, Issued]:
         """The certificates of the authority, by name; none if the file is missing or broken: renewals fill it."""

@@ -25,6 +25,7 @@ from rmpa.core.statistics import Counters
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.trust import limits
 from rmpa.trust import store as files_of
 from rmpa.trust.certificates import DenyList, make_request, read_certificate
 from rmpa.trust.joining import JoinServer, join_mesh, renew_at_authority
@@ -39,7 +40,7 @@ from rmpa.trust.membership import (
 )
 from rmpa.trust.permissions import TrustError
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, TrustStore, join_context, member_context
-from rmpa.trust.tokens import CertificateGrant, Join, JoinRefused, Renew, encode_message, proof_of
+from rmpa.trust.tokens import CertificateGrant, Invitation, Join, JoinRefused, Renew, encode_message, proof_of
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -122,7 +123,7 @@ async def test_a_token_lets_one_module_join_also_after_a_restart(lab: Lab) -> No
         await lab.join(token)
         with pytest.raises(PeerRefused, match=r"\(used\); each token lets one module join; ask for a new one"):
             await lab.join(token, "gripper")
-    [kept] = lab.store.load_tokens().invitations
+    [kept] = lab.store.load_tokens()
     assert (kept.used_by, kept.key) == ("arm", b"")
 
 
@@ -139,7 +140,7 @@ async def test_a_token_is_used_before_a_certificate_is_issued(lab: Lab, monkeypa
             await lab.join(token)
         with pytest.raises(PeerRefused, match=r"\(used\)"):
             await lab.join(token)
-    assert lab.store.load_tokens().invitations[0].used_by == "arm"
+    assert lab.store.load_tokens()[0].used_by == "arm"
 
 
 async def test_a_request_that_is_not_of_the_tokens_holder_lets_nothing_join(lab: Lab) -> None:
@@ -190,7 +191,7 @@ async def test_another_authority_at_the_address_is_not_joined(lab: Lab, tmp_path
     async with running(lab), running(other):
         token = lab.invite()
         forged = replace(token, port=other.port)  # as something in the middle that has stolen the token has it
-        other.authority.book.invite(forged)
+        other.authority.invitations[forged.token_id] = Invitation(forged.token_id, forged.key, forged.expires)
         with pytest.raises(PeerRefused, match="does not have the fingerprint of the token"):
             await lab.join(forged)
 
@@ -294,14 +295,32 @@ async def test_the_deny_list_names_the_members_while_a_revoked_certificate_may_b
         assert lab.base.deny.number == 2, "what was revoked has ended"
 
 
+def test_a_new_token_for_a_name_replaces_the_open_one(lab: Lab) -> None:
+    lab.port = 1
+    _, second, other = lab.invite("arm"), lab.invite("arm"), lab.invite()
+    assert list(lab.authority.invitations) == [second.token_id, other.token_id]
+    with pytest.raises(ValueError, match="not a ROS base name"):
+        lab.invite("my arm")
+
+
+def test_tokens_are_bounded_and_used_ones_go_first(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TOKENS_MAX", 3)
+    lab.port = 1
+    first, used, last = (lab.invite(lifetime=seconds) for seconds in (1.0, 2.0, 3.0))
+    lab.authority.invitations[used.token_id].used_by = "arm"
+    fourth = lab.invite()
+    assert list(lab.authority.invitations) == [first.token_id, last.token_id, fourth.token_id]
+    fifth = lab.invite()
+    assert list(lab.authority.invitations) == [last.token_id, fourth.token_id, fifth.token_id]
+
+
 async def test_revoking_ends_invitations_of_that_name(lab: Lab) -> None:
     async with running(lab):
         named, other = lab.invite("arm"), lab.invite("leg")
         lab.authority.revoke("arm")
         with pytest.raises(PeerRefused, match=r"\(token\)"):
             await lab.join(named)
-        assert lab.authority.book.find(other.token_id) is not None
-        assert lab.store.load_tokens().find(named.token_id) is None
+        assert [each.token_id for each in lab.store.load_tokens()] == [other.token_id]
         assert [each.name for each in lab.authority.issued] == ["base"]
 
 
@@ -310,7 +329,6 @@ def test_a_full_disk_does_not_stop_a_revocation_half_way(lab: Lab, monkeypatch: 
         raise StartError(name, "cannot be written: No space left on device", "is the disk full?")
 
     monkeypatch.setattr(lab.store, "write", full)
-    lab.base.save = full
     assert lab.authority.revoke("arm").number == 1
     assert (lab.base.deny.number, lab.base.keys.number) == (1, 2)
 
