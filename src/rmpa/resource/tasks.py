@@ -400,7 +400,7 @@ class Tasks(RuntimePart):
         # It is empty after the first such window, because that alone may be due to load of the machine.
         self._slow: dict[str, str] = {}
         self._next_check: float | None = None
-        self._timer = MachineTimer(lambda: self._next_check, self._check_stuck, now=time.monotonic)
+        self._timer = MachineTimer(lambda: self._next_check, self._check_stuck)
 
     def report(self, problem: str) -> str:
         """Log a new problem of a task, and return it."""

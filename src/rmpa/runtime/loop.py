@@ -84,22 +84,14 @@ class MachineTimer:
     """One pending timer for one machine, moved whenever the machine's ``next_timer()`` has changed.
 
     Args:
-        next_timer: Returns when the machine must be called, in seconds of ``now``; ``None``: not at all.
+        next_timer: Returns when the machine must be called, by the loop's ``time()``; ``None``: not at all.
         on_due: Called with the time, which is never before the requested time, although the event loop may call early
             by its clock's resolution. Afterwards the timer is armed again.
-        now: The clock of the machine; by default the event loop's ``time()``.
     """
 
-    def __init__(
-        self,
-        next_timer: Callable[[], float | None],
-        on_due: Callable[[float], object],
-        *,
-        now: Callable[[], float] | None = None,
-    ) -> None:
+    def __init__(self, next_timer: Callable[[], float | None], on_due: Callable[[float], object]) -> None:
         self._next_timer = next_timer
         self._on_due = on_due
-        self._now = now
         self._handle: asyncio.TimerHandle | None = None
         self._due: float | None = None
         self._closed = False
@@ -111,12 +103,8 @@ class MachineTimer:
             return
         self._cancel()
         if due is not None:
-            loop = asyncio.get_running_loop()
             self._due = due
-            if self._now is None:
-                self._handle = loop.call_at(due, self._fire)
-            else:
-                self._handle = loop.call_later(max(0.0, due - self._now()), self._fire)
+            self._handle = asyncio.get_running_loop().call_at(due, self._fire)
 
     def close(self) -> None:
         """Cancel the timer, and drop the references to the machine, whose owner may hold this timer (a cycle)."""
@@ -133,7 +121,7 @@ class MachineTimer:
 
     def _fire(self) -> None:
         due, self._due, self._handle = self._due, None, None
-        now = asyncio.get_running_loop().time() if self._now is None else self._now()
+        now = asyncio.get_running_loop().time()
         self._on_due(now if due is None else max(due, now))
         self.arm()
 

@@ -10,6 +10,7 @@ import contextlib
 import hmac
 import logging
 import ssl
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
@@ -34,6 +35,7 @@ _log = logging.getLogger(__name__)
 _READ = 16 * 1024
 
 
+@dataclass(eq=False)
 class JoinServer:
     """The authority's end of joins and renewals.
 
@@ -44,17 +46,13 @@ class JoinServer:
         counters: Counts what is refused: ``trust.join_refused``, ``trust.renewal_refused``.
     """
 
-    def __init__(
-        self,
-        authority: MeshAuthority,
-        clock: SystemClock,
-        is_linked: Callable[[str], bool],
-        counters: Counters,
-    ) -> None:
-        self._authority = authority
-        self._clock = clock
-        self._refusals = RefusalLog(_log, counters)
-        self._is_linked = is_linked
+    authority: MeshAuthority
+    clock: SystemClock
+    is_linked: Callable[[str], bool]
+    counters: Counters
+
+    def __post_init__(self) -> None:
+        self._refusals = RefusalLog(_log, self.counters)
         # What came of each token, by its id.
         self._steps: dict[bytes, JoinStep] = {}
         # Set, and replaced, at each step.
@@ -105,14 +103,14 @@ class JoinServer:
                 return self._join(asked, host)
             if not isinstance(asked, tokens.Renew) or presented is None:
                 raise RemoteProtocolError("a join or renewal that begins with something else than its question")
-            before = self._authority.judge_renewal(presented)
-            grant = self._authority.grant(asked.request, before.name)
+            before = self.authority.judge_renewal(presented)
+            grant = self.authority.grant(asked.request, before.name)
             _log.info("= %s at %s has a new certificate; it was away", before.name, host)
         except TrustError as error:
             refused = tokens.JoinRefused(error.reason.label, str(error))
         except StartError as error:
             refused = tokens.JoinRefused(
-                "clock" if self._authority.membership.wall() is None else "authority", str(error)
+                "clock" if self.authority.membership.wall() is None else "authority", str(error)
             )
         else:
             return grant
@@ -121,12 +119,12 @@ class JoinServer:
     def _refuse(self, what: str, host: str, refused: tokens.JoinRefused) -> tokens.JoinRefused:
         """Log what each connection can repeat, within limits."""
         text = f"refused a {what} by {host} ({refused.reason}): {refused.text}"
-        self._refusals.refuse(self._clock.now(), f"trust.{what}_refused", host, text)
+        self._refusals.refuse(self.clock.now(), f"trust.{what}_refused", host, text)
         return refused
 
     def _join(self, asked: tokens.Join, host: str) -> tokens.CertificateGrant | tokens.JoinRefused:
         """Let a module join: its token is used, also after a crash, before a certificate is issued."""
-        authority, name = self._authority, certificates.read_request(asked.request).name
+        authority, name = self.authority, certificates.read_request(asked.request).name
         invitation = authority.invitations.get(asked.token)
         problem = "token" if invitation is None else invitation.problem(name, authority.wall())
         if invitation is None or problem:
@@ -136,7 +134,7 @@ class JoinServer:
             tokens.proof_of(invitation.key, asked.request, authority.membership.files.certificate), asked.proof
         ):
             refused = tokens.JoinRefused("token", "the request is not signed with the token's key")
-        elif self._is_linked(name) or authority.has_issued(name, invitation.name):
+        elif self.is_linked(name) or authority.has_issued(name, invitation.name):
             refused = tokens.JoinRefused(
                 "taken", f"a module named {name} is a member: choose another --name, or revoke it"
             )

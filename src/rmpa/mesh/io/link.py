@@ -143,7 +143,7 @@ class Connection(ConnectionProtocol):
             counters=mesh.counters,
             pace=mesh.pace,
         )
-        self._timer = MachineTimer(self.next_timer, self._due, now=mesh.clock.now)
+        self._timer = MachineTimer(self.next_timer, self._due)
         self.flush()
 
     @property

@@ -91,7 +91,7 @@ class Mesh:
         self.refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
         self.peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
-        self._timer = MachineTimer(self.peering.next_timer, self._due, now=self.clock.now)
+        self._timer = MachineTimer(self.peering.next_timer, self._due)
         self._connections: dict[int, Connection] = {}
         # The links, by the id of the express lane's connection.
         self._links: dict[int, PeerLink] = {}
