@@ -131,14 +131,14 @@ class MeshPeer(RosterPeer):
 
     def link_up(self, link: PeerLink) -> None:
         """A peer is linked."""
-        self.note(f"= link {link.id} up {link.identity}")
+        self.note(f"= link up {link.identity}")
         link.bulk._on_wanted()
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 
     def link_down(self, link: PeerLink, reason: str) -> None:
         """Its link is not used any more."""
-        self.note(f"= link {link.id} down {link.identity}: {reason}")
+        self.note(f"= link down {link.identity}: {reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)
         self.flush()
 

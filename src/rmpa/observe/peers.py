@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.packet_filter import Stranger
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import Peer
     from rmpa.trust.permissions import TrustStatus
@@ -158,7 +159,9 @@ class Peers:
         peers = [info for info in infos if info.state not in (FOREIGN, PENDING)]
         return mark_shared_addresses(peers, own, yielding_to_data), tuple(strange)
 
-    def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
+    def _peer(
+        self, view: PeerView | None, status: Peer[PeerLink] | None, session: PeerSession | None, now: float
+    ) -> PeerInfo:
         run = view.run if view is not None else None
         identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         since = status.since if status is not None and status.since is not None else run.since if run else now

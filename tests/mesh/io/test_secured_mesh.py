@@ -39,7 +39,7 @@ def _has_all(peer: Peer) -> bool:
     return len(peer.data) == 2 and bool(peer.controls)
 
 
-def status(at: Peer, of: Peer) -> KnownPeer:
+def status(at: Peer, of: Peer) -> KnownPeer[PeerLink]:
     return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
 
 

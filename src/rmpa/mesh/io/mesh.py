@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 import random
-from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
@@ -90,15 +89,12 @@ class Mesh:
         self.acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self.refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
-        self.peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
+        self.peering: Peering[PeerLink] = Peering(identity, rng=rng)
         self._timer = MachineTimer(self.peering.next_timer, self._due)
-        self._connections: dict[int, Connection] = {}
-        # The links, by the id of the express lane's connection.
-        self._links: dict[int, PeerLink] = {}
+        self._connections: list[Connection] = []
         # The dials that are under way.
         self._tasks = OwnedTasks()
         self._securing = None if security is None else Securing(self, security, on_join)
-        self._ids = count(1)
         self._acting = False
         self._running = False
 
@@ -154,17 +150,18 @@ class Mesh:
         """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
         self.pace.rest_lease = rest_lease(peers)
 
-    def peers(self) -> list[Peer]:
+    def peers(self) -> list[Peer[PeerLink]]:
         """All known peers: linked, or why not and when the next attempt is due."""
         return self.peering.peers()
 
     def connections(self) -> list[Connection]:
         """All connections, those without a handshake too."""
-        return list(self._connections.values())
+        return list(self._connections)
 
     def links(self) -> list[PeerLink]:
         """The links that are used, one a peer."""
-        return [link for link in self._links.values() if link.used]
+        links = ((each, each.link) for each in self._connections)
+        return [link for each, link in links if link is not None and link.used and link.connection is each]
 
     def link(self, guid: Guid) -> PeerLink | None:
         """The link that is used with this peer."""
@@ -188,9 +185,7 @@ class Mesh:
         """Make a link of a connection whose handshake succeeded, or the bulk lane of one."""
         connection.expected = None
         if connection.lane != Lane.BULK:
-            link = self._links[connection.id] = PeerLink(connection, self)
-            now, endpoint = self.clock.now(), link.remote_endpoint
-            self.peering.link_up(link.id, link.identity, now, dialled=link.dialled, endpoint=endpoint)
+            self.peering.link_up(PeerLink(connection, self), self.clock.now())
             self._act()
             return
         there = (link for link in self.links() if link.guid.place == connection.identity.guid.place)
@@ -223,10 +218,10 @@ class Mesh:
         """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
         if not by_us:
             _log_refusal(connection.name, refuse)
-        link = self._links.get(connection.id)
-        if link is not None and link.used:
+        link = connection.link
+        if link is not None and link.used and link.connection is connection:
             # Not when its socket is closed: a revoked peer need not answer the refusal.
-            self.peering.link_down(link.id, str(refuse), self.clock.now())
+            self.peering.link_down(link, str(refuse), self.clock.now())
             self._act()
         if connection.remote is not None:
             self.peering.link_refused(connection.remote.guid, refuse)
@@ -234,7 +229,7 @@ class Mesh:
     def ended(self, connection: Connection, reason: str) -> None:
         """Handle the end of a connection: of a dial, of a link, or of a bulk lane, without which the link goes on."""
         now = self.clock.now()
-        del self._connections[connection.id]
+        self._connections.remove(connection)
         if connection.malformed:
             self.refusals.refuse(now, "link.malformed", connection.remote_endpoint[0], reason)
         elif connection.since is None and not connection.dialled:
@@ -245,25 +240,24 @@ class Mesh:
             return
         if connection.expected is not None:
             self.peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
-        if (link := self._links.get(connection.id)) is not None:
+        if (link := connection.link) is not None:
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
-            self.peering.link_down(link.id, reason, now, silent=connection.silent, needed=needed)
+            self.peering.link_down(link, reason, now, silent=connection.silent, needed=needed)
         self._act()
-        self._links.pop(connection.id, None)
 
     def _bulk_ended(self, bulk: Connection, reason: str) -> None:
         _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
-        for link in list(self._links.values()):
-            if link.bulk_connection is bulk:
-                link.detach(bulk)
-            elif bulk.expected != link.guid:
-                continue
-            if link.used:
-                self.counters.add("link.bulk_lost")
-                _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
-                self.dial_bulk(link, link.backoff.delay() if link.dialled else 0.0)
+        link = bulk.link
+        if link is not None:
+            link.detach(bulk)
+        elif bulk.expected is not None:
+            link = self.link(bulk.expected)
+        if link is not None and link.used:
+            self.counters.add("link.bulk_lost")
+            _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
+            self.dial_bulk(link, link.backoff.delay() if link.dialled else 0.0)
 
     def _act(self) -> None:
         """Carry out what the peering machine asks for; a call from within a callback leaves it to the outer call."""
@@ -279,21 +273,19 @@ class Mesh:
         if self._running:
             self._timer.arm()
 
-    def _do(self, output: PeeringOutput) -> None:
+    def _do(self, output: PeeringOutput[PeerLink]) -> None:
         match output:
             case ("dial", guid, endpoints, briefly):
                 if self._running:
                     self._tasks.start(self._dial(guid, endpoints, briefly=briefly), f"dial {guid}")
-            case ("close", link_id, reason):
-                self._links[link_id].close(reason)
-            case ("up", link_id):
-                link = self._links[link_id]
+            case ("close", link, reason):
+                link.close(reason)
+            case ("up", link):
                 link.use(used=True)
                 _log.info("= %s: linked (%s)", link.identity, "dialled" if link.dialled else "accepted")
                 self.handlers.up(link)
                 self.dial_bulk(link)  # the peer may have asked for it before
-            case ("down", link_id, reason):
-                link = self._links[link_id]
+            case ("down", link, reason):
                 self.counters.add("link.replaced" if reason == REPLACED else "link.down")
                 _log.info("= %s: link down: %s", link.identity, reason)
                 link.over = reason
@@ -329,31 +321,14 @@ class Mesh:
                 sock.close()
         self._act()
 
-    def redial(self, link: PeerLink) -> None:
-        """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
-        if self._running and _is_over(link.redial):
-            link.redial = self._tasks.start(self._redial(link), f"redial {link.name}")
-
-    async def _redial(self, link: PeerLink) -> None:
-        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
-        while link.is_silent():
-            endpoints = list(dict.fromkeys([link.remote_endpoint, *self.peering.endpoints(link.guid)]))
-            try:
-                sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
-                if not link.is_silent() or not link.connection.stream.unacknowledged:
-                    sock.close()  # it ended meanwhile, or is silent, but not for want of a way to it
-                    return
-                secured = await self._secure(sock)
-            except OSError as error:
-                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-            else:
-                self._open(sock, endpoint, link=link, secured=secured)
-                return
+    def link_silent(self, link: PeerLink) -> None:
+        """Take in that nothing comes over a link that this side dialled."""
+        self.peering.link_silent(link)
+        self._act()
 
     def dial_bulk(self, link: PeerLink, delay: float = 0.0) -> None:
         """Dial the bulk lane of a link in ``delay`` seconds, if it is wanted and missing, and this side has to."""
-        missing = link.bulk_connection is None and _is_over(link.bulk_dial)
+        missing = link.bulk_connection is None and (link.bulk_dial is None or link.bulk_dial.done())
         if self._running and link.used and link.dialled and link.bulk_wanted and missing:
             link.bulk_dial = self._tasks.start(self._dial_bulk(link, delay), f"bulk {link.name}")
 
@@ -369,7 +344,10 @@ class Mesh:
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
                 await asyncio.sleep(link.backoff.delay())
             else:
-                self._open(sock, link.remote_endpoint, link=link, lane=Lane.BULK, secured=secured)
+                if link.used:
+                    self._open(sock, link.remote_endpoint, expected=link.guid, lane=Lane.BULK, secured=secured)
+                else:
+                    sock.close()  # the link ended meanwhile
                 return
 
     async def _secure(self, sock: socket.socket) -> SecuredSocket | None:
@@ -388,18 +366,11 @@ class Mesh:
         endpoint: SocketAddress,
         *,
         expected: Guid | None = None,
-        link: PeerLink | None = None,
         lane: Lane = Lane.EXPRESS,
         secured: SecuredSocket | None = None,
     ) -> None:
-        """Begin the handshake of a connection that was accepted, or dialled to ``expected`` or for a link."""
-        if link is not None and not link.used:
-            sock.close()  # the link ended meanwhile
-            return
-        number, guid = next(self._ids), expected if link is None else link.guid
-        self._connections[number] = Connection(
-            number, self, sock, endpoint, dialled=guid is not None, expected=guid, lane=lane, secured=secured
-        )
+        """Begin the handshake of a connection that was accepted, or dialled to ``expected``."""
+        self._connections.append(Connection(self, sock, endpoint, expected=expected, lane=lane, secured=secured))
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
         if self._securing is not None:
@@ -419,7 +390,3 @@ class Mesh:
             sock.close()
             text = f"closed a connection from {host}: too many have not said who they are ({there} from there)"
             self.refusals.refuse(self.clock.now(), "link.pending_full", host, text)
-
-
-def _is_over(task: asyncio.Task[None] | None) -> bool:
-    return task is None or task.done()
