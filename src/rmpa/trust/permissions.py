@@ -24,7 +24,7 @@ from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from rmpa.config.settings import TrustSettings
 
@@ -201,12 +201,7 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
     return next((glob for glob in globs if matches(glob, name)), None)
 
 
-# How signed documents reach every module. Which linked peer lacks which document (docs/design/trust.md).
-#
-# Each module tells a new link the numbers of its documents (``trust.have``); the side with a higher number sends
-# that document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So
-# a document is everywhere after as many trips as the mesh is wide, and in a mesh that was split once it is whole
-# again.
+# How signed documents reach every module: ``agent.trust.AgentTrust`` sends each peer those that it lacks.
 
 
 class Document(StrEnum):
@@ -238,43 +233,6 @@ class Have(msgspec.Struct, frozen=True, omit_defaults=True):
     def numbers(self) -> dict[Document, int]:
         """The numbers by document."""
         return {Document.DENY: self.deny, Document.KEYS: self.keys}
-
-
-class DocumentSpreading:
-    """Knows what each linked peer has.
-
-    Args:
-        number: The number of the document that this module has.
-    """
-
-    def __init__(self, number: Callable[[Document], int]) -> None:
-        self._number = number
-        self._known: dict[int, dict[Document, int]] = {}
-
-    def link_up(self, peer: int) -> None:
-        """A peer is linked; it has not said what it has."""
-        self._known[peer] = {}
-
-    def link_down(self, peer: int) -> None:
-        """A peer is not linked any more."""
-        self._known.pop(peer, None)
-
-    def has(self, peer: int, numbers: Mapping[Document, int]) -> None:
-        """A peer has these documents, as it says or as it sent them."""
-        known = self._known.get(peer, {})
-        known.update({kind: max(number, known.get(kind, 0)) for kind, number in numbers.items()})
-
-    def lacking(self) -> list[tuple[int, Document]]:
-        """Each peer that is known to lack a document, and which; they count as sent."""
-        found = [
-            (peer, kind)
-            for peer, known in self._known.items()
-            for kind in Document
-            if kind in known and known[kind] < self._number(kind)
-        ]
-        for peer, kind in found:
-            self._known[peer][kind] = self._number(kind)
-        return found
 
 
 # The reasons for which a secured mesh refuses a connection. One word each, for wire, counters, commands and logs.
