@@ -16,7 +16,7 @@ from rmpa.discovery.membership import BURST_OFFSETS
 from tests.discovery.test_membership import Harness
 
 if TYPE_CHECKING:
-    from rmpa.discovery.announcing import OutgoingBeacon
+    from rmpa.discovery.beacon import OutgoingBeacon
 
 MEMBERS = 1000
 

@@ -17,8 +17,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.statistics import Counters
 from rmpa.core.timers import earliest
 from rmpa.discovery import limits
-from rmpa.discovery.announcing import BeaconSender, GossipCandidates
-from rmpa.discovery.beacon import BeaconKind
+from rmpa.discovery.beacon import BeaconKind, BeaconSender, GossipCandidates
 from rmpa.discovery.endpoints import LINKED, NEVER, Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
 
 if TYPE_CHECKING:
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.identity import Guid, Identity
     from rmpa.core.timers import Yielder
-    from rmpa.discovery.announcing import OutgoingBeacon
-    from rmpa.discovery.beacon import Address, Beacon
+    from rmpa.discovery.beacon import Address, Beacon, OutgoingBeacon
     from rmpa.discovery.endpoints import PeerView
 
 # When a starting agent announces itself, in seconds after its start: Wi-Fi loses multicast, so one beacon is not

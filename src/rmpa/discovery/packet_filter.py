@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.log import RefusalLog
-from rmpa.core.timers import TokenBucket
+from rmpa.core.timers import AddressLimit, TokenBucket
 from rmpa.discovery import limits
-from rmpa.discovery.announcing import AddressLimit
 from rmpa.discovery.beacon import (
     INSTANCE_AT,
     MALFORMED,
