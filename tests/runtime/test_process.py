@@ -21,8 +21,8 @@ import pytest
 
 from rmpa.core.log import configure_logging
 from rmpa.runtime import limits, realtime
-from rmpa.runtime.files import set_aside
 from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.programs import set_aside
 from rmpa.runtime.systemd import restart_text, watchdog_period
 
 NOBODY: Final = 65534

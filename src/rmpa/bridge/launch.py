@@ -27,8 +27,7 @@ from rmpa.config.values import suggestion
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_meant
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.files import replace_file
-from rmpa.runtime.programs import RUNS, CpuShares, ProgramMark
+from rmpa.runtime.programs import RUNS, CpuShares, ProgramMark, replace_file
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 from rmpa.trust.permissions import PermissionDecision, asker_name, refusal
 
