@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.statistics import Counters
-from rmpa.mesh.io.dial import Dialler
+from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.runtime.loop import SystemClock

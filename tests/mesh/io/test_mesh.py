@@ -23,7 +23,7 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import (
+from rmpa.mesh.io.lane import (
     BULK_WINDOW_MAX,
     BULK_WINDOW_MIN,
     DIAL_ATTEMPTS,

@@ -13,8 +13,7 @@ import pytest
 from rmpa.config.settings import LaneSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh.frames import Frame, FrameKind, Lane, pack_data_header
-from rmpa.mesh.io.dial import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED
-from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.lane import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED, LaneSender
 from rmpa.mesh.io.link import Connection, PeerLink
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 

@@ -17,8 +17,7 @@ from rmpa.core.timers import Backoff
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
 from rmpa.mesh.frames import Frame, FrameKind, Lane
-from rmpa.mesh.io.dial import bound_queue
-from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.lane import LaneSender, bound_queue
 from rmpa.mesh.io.securing import tls_failure
 from rmpa.mesh.peering import REPLACED, RESTARTED, Link
 from rmpa.runtime.loop import MachineTimer

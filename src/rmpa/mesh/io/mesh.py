@@ -14,7 +14,7 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import Dialler
+from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError
 from rmpa.mesh.keepalive import Pace, rest_lease
