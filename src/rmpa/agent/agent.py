@@ -53,10 +53,9 @@ from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.http.server import listen
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.slave_node import LoggerServices
-from rmpa.runtime import realtime
 from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
-from rmpa.runtime.loop import SystemClock
+from rmpa.runtime.loop import SystemClock, freeze_heap, thaw_heap
 from rmpa.runtime.systemd import unit_of
 from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import Permissions
@@ -504,8 +503,8 @@ class Agent:
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self.control.start()
-            realtime.freeze_heap()
-            undo.callback(realtime.thaw_heap)
+            freeze_heap()
+            undo.callback(thaw_heap)
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", shown_uri(self.core.uri))
         self.network.warn_if_open()

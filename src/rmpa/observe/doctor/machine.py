@@ -32,7 +32,7 @@ from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.realtime import REMEDY
+from rmpa.runtime.loop import REALTIME_REMEDY
 from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: b
     if not missing:
         yield Check("realtime", OK, "SCHED_FIFO and locked memory are allowed")
     elif wanted:
-        yield Check("realtime", WARN, "; ".join(missing), REMEDY)
+        yield Check("realtime", WARN, "; ".join(missing), REALTIME_REMEDY)
     else:
         yield Check("realtime", OK, f"{'; '.join(missing)}; not asked for (rmpa up --realtime)")
     # Each subscriber takes one, and a proxy two where proxies cannot share their sockets.
