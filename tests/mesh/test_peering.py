@@ -11,20 +11,10 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Hello, Refusal, Refuse
-from rmpa.mesh.peering import LINK_STABLE, REFUSED_RETRY, Link, Peering, PeeringOutput
-from tests.mesh.worlds import HIGH, LOW
+from rmpa.mesh.peering import LINK_STABLE, REFUSED_RETRY, Peering, PeeringOutput
+from tests.mesh.worlds import HIGH, LOW, Known, with_peer
 
 AGAIN = Identity(Guid.of("10.0.0.2", 40002, 2), b"A" * 16, "high")
-
-
-class Known(Link):
-    """A link whose state a test sets."""
-
-    alive, stuck = True, False
-
-
-def with_peer(identity: Identity, *, dialled: bool = True) -> Known:
-    return Known(identity, identity.guid.endpoint, dialled=dialled)
 
 
 def of(ours: Identity) -> Peering[Known]:

@@ -21,6 +21,7 @@ from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
+    from rmpa.mesh.peering import Link
 
 Buffer = bytes | bytearray | memoryview
 
@@ -378,23 +379,13 @@ FULL: Final = Refuse(
 )
 
 
-def judge(
-    hello: Hello,
-    ours: Identity,
-    linked: Identity | None = None,
-    *,
-    dialled: bool = False,
-    alive: bool = True,
-    full: bool = False,
-) -> Refuse | None:
+def judge(hello: Hello, ours: Identity, link: Link | None = None, *, full: bool = False) -> Refuse | None:
     """Decide on a hello: ``None`` accepts the connection.
 
     Args:
         hello: The dialler's hello.
         ours: The identity of this agent.
-        linked: The peer of the link that is up with the hello's address and port; ``None``: there is no such link.
-        dialled: Whether this side dialled that link.
-        alive: Whether bytes were received on it lately; otherwise the peer may be dead.
+        link: The link that is up with the hello's address and port; ``None``: there is none.
         full: Whether there is no place for one more peer.
     """
     if refuse := _judge_identity(hello, ours):
@@ -404,16 +395,16 @@ def judge(
     if hello.expected is not None and hello.expected.place != ours.guid.place:
         text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
-    same_run = linked is not None and linked.instance == hello.instance
+    same_run = link is not None and link.identity.instance == hello.instance
     if hello.lane == Lane.BULK:
         text = "a bulk lane belongs to an express one, and there is none yet"
         return None if same_run else Refuse(Refusal.NO_EXPRESS, text)
-    if linked is None:
+    if link is None:
         return FULL if full else None
     if same_run:
         text = "we are linked already; the link that the lower GUID dialled stays"
-        return Refuse(Refusal.ALREADY_LINKED, text) if dialled and ours.guid < hello.guid else None
-    return _duplicate(hello.guid) if alive else None
+        return Refuse(Refusal.ALREADY_LINKED, text) if link.dialled and ours.guid < hello.guid else None
+    return _duplicate(hello.guid) if link.alive else None
 
 
 def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refuse | None:

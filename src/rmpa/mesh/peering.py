@@ -241,11 +241,7 @@ class Peering(Generic[_L]):
         if peer is not None and hello.lane == Lane.EXPRESS and self._crosses(peer, hello, now):
             text = "we dial each other; the link that the lower GUID dials stays"
             return Refuse(Refusal.ALREADY_LINKED, text)
-        if peer is None or peer.link is None:
-            refuse = judge(hello, self._ours, full=self._full(peer))
-        else:
-            link = peer.link
-            refuse = judge(hello, self._ours, link.identity, dialled=link.dialled, alive=link.alive)
+        refuse = judge(hello, self._ours, None if peer is None else peer.link, full=self._full(peer))
         if refuse is FULL:
             self.link_refused(hello.guid, refuse)
         return refuse

@@ -318,7 +318,7 @@ async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
         links = [*references(one, other), *references(other, one)]
         for _ in range(20):
             one.link(other).bulk.send(1, 1, 0, bytes(MB))
-        assert one.link(other).queue_bytes
+        assert one.link(other).info().queued
         if way == "end":
             await other.mesh.close()
         else:

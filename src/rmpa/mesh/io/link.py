@@ -411,21 +411,6 @@ class PeerLink(Link):
         return self.connection.stream.resumed_at
 
     @property
-    def bytes_in(self) -> int:
-        """Bytes received, headers included, by both lanes."""
-        return self._bulk_in + sum(connection.stream.bytes_in for connection in self._connections())
-
-    @property
-    def bytes_out(self) -> int:
-        """Bytes that the kernel took, headers included, on both lanes."""
-        return self._bulk_out + sum(connection.stream.bytes_out for connection in self._connections())
-
-    @property
-    def queue_bytes(self) -> int:
-        """Bytes that the kernel has not taken yet, on both lanes."""
-        return self.connection.stream.pending_bytes + self.bulk.outbox.pending_bytes
-
-    @property
     def busy(self) -> bool:
         """Whether the express lane has a backlog, so that a further advertisement would delay later commands."""
         stream = self.connection.stream
@@ -452,9 +437,9 @@ class PeerLink(Link):
             rtt=self.connection.clock.rtt,
             clock_offset=self.clock_offset,
             clock_error=self.clock_error,
-            bytes_in=self.bytes_in,
-            bytes_out=self.bytes_out,
-            queued=self.queue_bytes,
+            bytes_in=self._bulk_in + sum(lane.bytes_in for lane in lanes),
+            bytes_out=self._bulk_out + sum(lane.bytes_out for lane in lanes),
+            queued=sum(lane.queued for lane in lanes),
             dropped=sum(lane.dropped for lane in lanes),
             heard_ago=now - self.heard_at,
             rests=self.rests,
