@@ -74,9 +74,9 @@ class Sender:
             sock,
             on_bytes=lambda view: (len(view), 0),
             on_close=self.ends.append,
-            outbox=box,
-            frame=pack_fragment_header,
+            outbox=Outbox(1, 1),
         )
+        self.stream.adopt(box, pack_fragment_header)
         STREAMS.append(self.stream)
         self.number = 0
         self.sent: list[tuple[int, int]] = []

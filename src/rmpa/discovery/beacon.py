@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import rmpa
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import Guid, Identity, dialable, serial_add
-from rmpa.core.limits import UINT32_MAX
+from rmpa.core.limits import PEER_LEASE, UINT32_MAX
 from rmpa.core.timers import AddressLimit, Backoff, TimerQueue, TokenBucket
 from rmpa.discovery import limits
 
@@ -333,7 +333,6 @@ class BeaconSender:
     Args:
         identity: This agent's own.
         endpoints: The peers.
-        lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where answers that were held back are counted.
         multicast: Whether to send to the group at all.
 
@@ -341,14 +340,11 @@ class BeaconSender:
         closed: Whether nothing is sent any more: a goodbye was the last beacon.
     """
 
-    def __init__(
-        self, identity: Identity, endpoints: EndpointTable, lease: float, counters: Counters, *, multicast: bool
-    ) -> None:
+    def __init__(self, identity: Identity, endpoints: EndpointTable, counters: Counters, *, multicast: bool) -> None:
         self.identity = identity
         self.multicast = multicast
         self.closed = False
         self._endpoints = endpoints
-        self._lease_ms = round(lease * 1000)
         self._counters = counters
         self._sequence = 0
         self._turn = 0
@@ -367,7 +363,7 @@ class BeaconSender:
             return
         self._sequence = serial_add(self._sequence, 1)
         observed = self._observed(gossip)
-        beacon = Beacon(kind, self.identity, self._lease_ms, self._sequence, gossip, observed)
+        beacon = Beacon(kind, self.identity, round(PEER_LEASE * 1000), self._sequence, gossip, observed)
         self._outputs.append(OutgoingBeacon(beacon, address, key))
 
     def send_multicast(self, kind: BeaconKind, now: float) -> None:

@@ -91,7 +91,6 @@ class MembershipProtocol:
         identity: This agent's own.
         rng: Uniform numbers in [0, 1), for jitter; seeded by simulations.
         multicast: Whether to send to the group at all.
-        lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where refusals are counted.
     """
 
@@ -101,13 +100,12 @@ class MembershipProtocol:
         *,
         rng: Callable[[], float],
         multicast: bool = True,
-        lease: float = core_limits.PEER_LEASE,
         counters: Counters | None = None,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
         self._rng = rng
         self._endpoints = EndpointTable()
-        self._sender = BeaconSender(identity, self._endpoints, lease, self.counters, multicast=multicast)
+        self._sender = BeaconSender(identity, self._endpoints, self.counters, multicast=multicast)
         self._candidates = GossipCandidates(rng)
         self._reported_names: set[frozenset[bytes]] = set()
         self._seeds: tuple[Address, ...] = ()

@@ -332,7 +332,6 @@ def issue(
     ca_key: ec.EllipticCurvePrivateKey,
     serial: int,
     wall: float,
-    lifetime: float = limits.CERTIFICATE_LIFETIME,
     hosts: Iterable[str] = (),
 ) -> bytes:
     """A certificate (DER) for a request. Nothing of the request but its name and key is taken over.
@@ -343,14 +342,13 @@ def issue(
         ca_key: Its key.
         serial: A random positive number of at most 159 bits.
         wall: Seconds since 1970.
-        lifetime: Seconds of its validity from now on.
         hosts: Names and addresses of its page, as the authority grants them.
     """
     authority = x509.load_der_x509_certificate(ca)
     issuer = _elliptic(authority.public_key())
     key = _elliptic(serialization.load_der_public_key(request.public_key))
     names = (*server_names(request.name), "127.0.0.1", *hosts)
-    begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + lifetime)
+    begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + limits.CERTIFICATE_LIFETIME)
     certificate = (
         _builder(_name(request.name), authority.subject, key, serial, begin, end, ca=False)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
