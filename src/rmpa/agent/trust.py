@@ -98,7 +98,7 @@ def open_membership(settings: Settings, clock: SystemClock) -> Membership | None
     except ModuleNotFoundError as error:
         missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
         raise StartError(str(store.folder), missing, missing_extra("trust"), code="extra-missing") from None
-    membership = Membership.load(store, clock, time.time)
+    membership = Membership.load(store, clock)
     if membership.name != settings.name:
         text = f"is of {membership.name}, but this agent is named {settings.name}"
         remedy = f"start it with --name {membership.name}, or let it join: rmpa trust leave, rmpa trust join TOKEN"

@@ -371,14 +371,14 @@ def read_request(data: bytes) -> CertificateRequest:
         request = x509.load_der_x509_csr(data)
         key = request.public_key()
         valid = isinstance(key, ec.EllipticCurvePublicKey) and request.is_signature_valid
-        name, hosts = _module_name(request), page_hosts(sorted(_hosts_in(request)))
+        name, hosts = _names_in(request)
     except _UNREADABLE as error:
         raise TrustError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
     if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != CURVE.name:
         raise TrustError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
     if not valid:
         raise TrustError(TrustReason.FOREIGN, "the request is not signed with its own key")
-    return CertificateRequest(name, _public_bytes(key), hosts)
+    return CertificateRequest(name, _public_bytes(key), page_hosts(sorted(hosts)))
 
 
 def read_certificate(data: bytes, ca: bytes) -> ModuleCertificate:
@@ -397,7 +397,7 @@ def read_certificate(data: bytes, ca: bytes) -> ModuleCertificate:
     try:
         certificate = x509.load_der_x509_certificate(data)
         certificate.verify_directly_issued_by(authority)
-        name, hosts = _module_name(certificate), _hosts_in(certificate)
+        name, hosts = _names_in(certificate)
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
         key = certificate.public_key()
     except InvalidSignature:
@@ -442,31 +442,25 @@ def ca_public_key(ca: bytes) -> ec.EllipticCurvePublicKey:
         raise TrustError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
 
 
-def _module_name(holder: x509.Certificate | x509.CertificateSigningRequest) -> str:
-    """The module that a certificate or a request is of.
+def _names_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> tuple[str, frozenset[str]]:
+    """The module that a certificate or a request is of, and the names and addresses of its page.
 
     Raises:
         ValueError: SAN and CN do not have one and the same valid name.
     """
-    names = [attribute.value for attribute in holder.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    common = [attribute.value for attribute in holder.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     try:
         alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         raise ValueError("it has no subject alternative name") from None
     uris = alternative.get_values_for_type(x509.UniformResourceIdentifier)
-    if len(uris) != 1 or not uris[0].startswith(URN) or names != [uris[0].removeprefix(URN)]:
+    if len(uris) != 1 or not uris[0].startswith(URN) or common != [uris[0].removeprefix(URN)]:
         raise ValueError(f"it does not have one name, as CN and as {URN}NAME")
     name = uris[0].removeprefix(URN)
     if problem := peer_name_problem(name):
         raise ValueError(problem)
-    return name
-
-
-def _hosts_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> frozenset[str]:
-    """The names and addresses in a SAN that ``_module_name`` has read."""
-    alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     addresses = map(str, alternative.get_values_for_type(x509.IPAddress))
-    return frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
+    return name, frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
 
 
 def _elliptic(key: object) -> ec.EllipticCurvePublicKey:

@@ -95,18 +95,16 @@ class Membership:
     Args:
         store: The files, which newer documents are written to.
         files: What is in them.
-        clock: Monotonic seconds.
-        wall: Seconds since 1970, by the machine's clock, set or not.
+        clock: The machine's clocks, set or not.
 
     Raises:
         StartError: A file is broken, or they do not belong together.
     """
 
-    def __init__(self, store: TrustStore, files: MemberFiles, clock: SystemClock, wall: Callable[[], float]) -> None:
+    def __init__(self, store: TrustStore, files: MemberFiles, clock: SystemClock) -> None:
         self.store = store
         self.files = files
         self._clock = clock
-        self._machine_wall = wall
         with _named(store, CERTIFICATE):
             self._ca_key = certificates.ca_public_key(files.ca)
             self.certificate = read_certificate(files.certificate, files.ca)
@@ -124,9 +122,9 @@ class Membership:
         self._make_contexts()
 
     @classmethod
-    def load(cls, store: TrustStore, clock: SystemClock, wall: Callable[[], float]) -> Membership:
+    def load(cls, store: TrustStore, clock: SystemClock) -> Membership:
         """Read the files of a member; arguments and errors as for the class."""
-        return cls(store, store.load(), clock, wall)
+        return cls(store, store.load(), clock)
 
     def __repr__(self) -> str:
         """Name and numbers alone: secrets never come into a log."""
@@ -147,7 +145,7 @@ class Membership:
 
     def wall(self) -> float | None:
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
-        wall = self._machine_wall()
+        wall = self._clock.wall_ns() / 1e9
         return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
 
     def read_member(self, certificate: bytes | None) -> ModuleCertificate:
@@ -183,19 +181,17 @@ class Membership:
             LimitExceeded: It is too long.
             RemoteProtocolError: It is malformed, or not signed by this mesh's authority.
         """
-        if kind is Document.DENY:
-            deny = read_document(data, self._ca_key, DenyList)
-            if deny.number <= self.deny.number:
-                return False
-            self.deny, self.files = deny, replace(self.files, deny=data)
+        form: type[DenyList | KeyList] = DenyList if kind is Document.DENY else KeyList
+        newer = read_document(data, self._ca_key, form)
+        if newer.number <= self.number(kind):
+            return False
+        if isinstance(newer, DenyList):
+            self.deny, self.files = newer, replace(self.files, deny=data)
             for call in tuple(self.on_denied):  # before a slow disk is written
                 call()
         else:
-            keys = read_document(data, self._ca_key, KeyList)
-            if keys.number <= self.keys.number:
-                return False
-            self.keys, self.files = keys, replace(self.files, keys=data)
-            self.ring.take(keys.keys, self._clock.now(), proves_from=keys.proves_from, age=self._age(keys, 0.0))
+            self.keys, self.files = newer, replace(self.files, keys=data)
+            self.ring.take(newer.keys, self._clock.now(), proves_from=newer.proves_from, age=self._age(newer, 0.0))
         try:
             self.store.write(DENY if kind is Document.DENY else KEYS, data)
         except StartError as error:

@@ -66,7 +66,7 @@ class Lab:
     def __post_init__(self) -> None:
         self.store = TrustStore(self.folder, "base")
         found_mesh(self.store, "base", "lab", WALL)
-        self.base = Membership.load(self.store, self.clock, self.clock.wall)
+        self.base = Membership.load(self.store, self.clock)
         self.authority = MeshAuthority(self.base)
         self.server = JoinServer(self.authority, self.clock, self.taken.__contains__, Counters())
 
@@ -79,7 +79,7 @@ class Lab:
     def member(self, files: MemberFiles, name: str = "arm") -> Membership:
         store = TrustStore(self.folder, name)
         store.save(files)
-        return Membership.load(store, self.clock, self.clock.wall)
+        return Membership.load(store, self.clock)
 
 
 @asynccontextmanager
@@ -372,7 +372,7 @@ async def test_a_module_joins_whatever_its_clock_shows(lab: Lab, wall: float) ->
         files = await lab.join(lab.invite())
     store = TrustStore(lab.folder, "arm")
     store.save(files)
-    arm = Membership.load(store, clock, clock.wall)
+    arm = Membership.load(store, clock)
     assert (arm.wall() is None) == (wall < WALL)
     if arm.wall() is None:
         arm.judge_member(arm.read_member(lab.base.files.certificate), "base")

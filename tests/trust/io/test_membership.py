@@ -80,7 +80,7 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
     assert base.document(Document.DENY) == newer
     assert reason_of(base, certificate, "arm") is TrustReason.REVOKED
     judge(base, mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
-    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+    again = Membership.load(base.store, mesh.clock)
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED
     mesh.clock.wall_seconds = 0.0
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED, "a clock that is set back lets none in again"
@@ -110,7 +110,7 @@ def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
     assert heard_by_arm() is Verdict.UNKNOWN_KEY
     assert arm.accept_document(Document.KEYS, data)
     assert heard_by_arm() is Verdict.ACCEPTED
-    assert Membership.load(arm.store, mesh.clock, mesh.clock.wall).ring.newest.number == 2
+    assert Membership.load(arm.store, mesh.clock).ring.newest.number == 2
 
 
 def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: SecuredMesh) -> None:
@@ -120,7 +120,7 @@ def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: Se
     assert base.accept_document(Document.KEYS, sign(rotated, mesh.authority.key))
     mesh.clock.seconds += 10
     mesh.clock.wall_seconds = WALL + 10
-    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+    again = Membership.load(base.store, mesh.clock)
 
     def heard(sender: Membership, receiver: Membership) -> Verdict:
         now = mesh.clock.now()
@@ -139,7 +139,7 @@ def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart
     for number, made in enumerate((keys, [*keys, GroupKey(3, b"o" * 32)]), 2):  # a rotation of the usual kind follows
         listed = KeyList(number, tuple(made), proves_from=2, made=int(WALL))
         assert base.accept_document(Document.KEYS, sign(listed, mesh.authority.key))
-        for member in (base, Membership.load(base.store, mesh.clock, mesh.clock.wall)):
+        for member in (base, Membership.load(base.store, mesh.clock)):
             now = mesh.clock.now()
             packet = revoked.packets.sign(PACKET, now)
             heard = member.packets.verify(packet, (0, 8), now)
@@ -158,7 +158,7 @@ def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:
     base.renewed(newer)
     assert base.certificate.expires == WALL + 11 * DAY
     assert base.server_context is not before
-    assert Membership.load(base.store, mesh.clock, mesh.clock.wall).certificate.serial == 77
+    assert Membership.load(base.store, mesh.clock).certificate.serial == 77
     with pytest.raises(TrustError, match="of another key"):
         base.renewed(mesh.authority.module("base", WALL + 4 * DAY))
     with pytest.raises(TrustError, match="of arm, not of base"):
@@ -177,14 +177,14 @@ def test_broken_files_are_named(mesh: SecuredMesh, name: str, content: bytes, wo
     store = mesh.save("base")
     store.write(name, content)
     with pytest.raises(StartError, match=words):
-        Membership.load(store, mesh.clock, mesh.clock.wall)
+        Membership.load(store, mesh.clock)
 
 
 def test_files_of_two_meshes_do_not_fit(mesh: SecuredMesh, tmp_path: Path) -> None:
     store, other = mesh.save("base"), SecuredMesh(tmp_path / "other").save("base")
     store.write(files_of.CA, other.path(files_of.CA).read_bytes())
     with pytest.raises(StartError, match=r"module\.crt: is broken: the certificate is of another CA"):
-        Membership.load(store, mesh.clock, mesh.clock.wall)
+        Membership.load(store, mesh.clock)
 
 
 def test_no_secret_is_in_a_repr(mesh: SecuredMesh) -> None:
