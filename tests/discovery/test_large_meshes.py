@@ -16,7 +16,7 @@ from rmpa.discovery.membership import BURST_OFFSETS
 from tests.discovery.test_membership import Harness
 
 if TYPE_CHECKING:
-    from rmpa.discovery.beacon import OutgoingBeacon
+    from rmpa.discovery.endpoints import OutgoingBeacon
 
 MEMBERS = 1000
 

@@ -13,21 +13,22 @@ import pytest
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits, membership
-from rmpa.discovery.beacon import (
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.endpoints import (
     CANDIDATE_LIFETIME,
     CANDIDATE_RETRY_MAX,
     CANDIDATES_BURST,
     CANDIDATES_PER_SECOND,
-    Beacon,
-    BeaconKind,
+    GOODBYE_LATE,
+    LEASE_MAX,
+    LEASE_MIN,
 )
-from rmpa.discovery.endpoints import GOODBYE_LATE, LEASE_MAX, LEASE_MIN
 from rmpa.discovery.membership import BURST_AGAIN_OFFSETS, BURST_JITTER, BURST_OFFSETS, MembershipProtocol, PeerEvent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.discovery.beacon import OutgoingBeacon
+    from rmpa.discovery.endpoints import OutgoingBeacon
 
 T0 = 1000.0
 

@@ -8,8 +8,7 @@ from typing import Any
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, DataHandler
-from rmpa.mesh.frames import FrameKind, Hello, Lane, Refuse
-from rmpa.mesh.peering import Link
+from rmpa.mesh.frames import FrameKind, Hello, Lane, Link, Refuse
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")

@@ -355,7 +355,7 @@ class Discovery:
                 self._timer.arm()
 
     def _send(self, beacon: Beacon, address: Address | None, key: int) -> None:
-        """Send a beacon, signed in a secured mesh; the arguments as for ``beacon.OutgoingBeacon``."""
+        """Send a beacon, signed in a secured mesh; the arguments as for ``endpoints.OutgoingBeacon``."""
         packet = beacon.serialize()
         if self._trust is not None:
             packet = self._trust.sign(packet, time.monotonic(), key)

@@ -17,8 +17,18 @@ from rmpa.core import limits as core_limits
 from rmpa.core.statistics import Counters
 from rmpa.core.timers import earliest
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import BeaconKind, BeaconSender, GossipCandidates
-from rmpa.discovery.endpoints import LINKED, NEVER, Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
+from rmpa.discovery.beacon import BeaconKind
+from rmpa.discovery.endpoints import (
+    LINKED,
+    NEVER,
+    BeaconSender,
+    Endpoint,
+    EndpointTable,
+    GossipCandidates,
+    PeerInstance,
+    shared_address,
+    shared_name,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -26,8 +36,8 @@ if TYPE_CHECKING:
 
     from rmpa.core.identity import Guid, Identity
     from rmpa.core.timers import Yielder
-    from rmpa.discovery.beacon import Address, Beacon, OutgoingBeacon
-    from rmpa.discovery.endpoints import PeerView
+    from rmpa.discovery.beacon import Address, Beacon
+    from rmpa.discovery.endpoints import OutgoingBeacon, PeerView
 
 # When a starting agent announces itself, in seconds after its start: Wi-Fi loses multicast, so one beacon is not
 # enough.

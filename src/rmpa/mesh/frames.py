@@ -21,7 +21,6 @@ from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
-    from rmpa.mesh.peering import Link
 
 Buffer = bytes | bytearray | memoryview
 
@@ -369,6 +368,31 @@ class Hello:
     def identity(self) -> Identity:
         """The sender's identity."""
         return Identity(self.guid, self.instance, self.name, self.domain)
+
+
+class Link:
+    """A link with a peer, as the machines of this room know it; the driver's is a subclass.
+
+    Args:
+        identity: The peer's, from the handshake; discovery need not have found it.
+        remote_endpoint: Address and port of the other end.
+        dialled: Whether this side dialled.
+    """
+
+    def __init__(self, identity: Identity, remote_endpoint: tuple[str, int], *, dialled: bool) -> None:
+        self.identity: Final = identity
+        self.remote_endpoint: Final = remote_endpoint
+        self.dialled: Final = dialled
+
+    @property
+    def alive(self) -> bool:
+        """Whether bytes were received lately, at the pace of the link; else the peer may be dead."""
+        raise NotImplementedError
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it is silent although bytes are under way to the peer, so that a new connection may do better."""
+        raise NotImplementedError
 
 
 # The answer to a module for which a mesh has no place; it may join when one becomes free.

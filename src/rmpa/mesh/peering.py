@@ -19,7 +19,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.timers import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FULL, Hello, Lane, Refusal, Refuse, judge
+from rmpa.mesh.frames import FULL, Hello, Lane, Link, Refusal, Refuse, judge
 from rmpa.trust.permissions import NOT_OF_THIS_MESH, TrustReason
 
 if TYPE_CHECKING:
@@ -58,33 +58,6 @@ _SELDOM_MENDED: Final = frozenset({*Refusal, *TrustReason}) - _UNPROVEN - _OTHER
 REPLACED: Final = "replaced by a newer link"
 # Why a link is no longer used: another run of the peer has taken its place.
 RESTARTED: Final = "the peer restarted"
-
-
-class Link:
-    """A link with a peer, as far as this machine has to know it; the driver's is a subclass.
-
-    Args:
-        identity: The peer's, from the handshake; discovery need not have found it.
-        remote_endpoint: Address and port of the other end.
-        dialled: Whether this side dialled.
-    """
-
-    def __init__(self, identity: Identity, remote_endpoint: SocketAddress, *, dialled: bool) -> None:
-        self.identity: Final = identity
-        self.remote_endpoint: Final = remote_endpoint
-        self.dialled: Final = dialled
-
-    @property
-    def alive(self) -> bool:
-        """Whether bytes were received lately, at the pace of the link; else the peer may be dead."""
-        raise NotImplementedError
-
-    @property
-    def stuck(self) -> bool:
-        """Whether it is silent although bytes are under way to the peer, so that a new connection may do better."""
-        raise NotImplementedError
-
-
 _L = TypeVar("_L", bound=Link)
 # What the driver has to do, or the rooms above have to know; see ``Peering.take``.
 PeeringOutput = (

@@ -16,10 +16,9 @@ from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
-from rmpa.mesh.frames import Frame, FrameKind, Lane
+from rmpa.mesh.frames import Frame, FrameKind, Lane, Link
 from rmpa.mesh.io.lane import LaneSender, bound_queue
-from rmpa.mesh.io.securing import tls_failure
-from rmpa.mesh.peering import REPLACED, RESTARTED, Link
+from rmpa.mesh.peering import REPLACED, RESTARTED
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
 
@@ -31,8 +30,9 @@ if TYPE_CHECKING:
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.peering import SocketAddress
+    from rmpa.runtime.tls import SecureSocket
+    from rmpa.trust.certificates import ModuleCertificate
 
 # Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
 # link is closed.
@@ -106,7 +106,7 @@ class Connection(ConnectionProtocol):
         *,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
-        secured: SecuredSocket | None = None,
+        secured: tuple[SecureSocket, ModuleCertificate] | None = None,
     ) -> None:
         self.mesh = mesh
         self.sock = sock
@@ -271,8 +271,7 @@ class Connection(ConnectionProtocol):
         self.crashed = self.up and (error is None or number in _ENDED_THERE)
         if isinstance(error, ssl.SSLError) and self.state is ConnectionState.HANDSHAKING:
             # In TLS 1.3 the acceptor judges the dialler's certificate when the dialler is already done.
-            failure = tls_failure(error)
-            self.refused(failure.refuse, by_us=failure.by_us)
+            self.mesh.tls_failed(self, error)
         self.lost(
             f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         )

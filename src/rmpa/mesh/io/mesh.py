@@ -16,7 +16,7 @@ from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
-from rmpa.mesh.io.securing import Securing, SecuringError
+from rmpa.mesh.io.securing import Securing, SecuringError, tls_failure
 from rmpa.mesh.keepalive import Pace, rest_lease
 from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
@@ -27,6 +27,7 @@ from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     import socket
+    import ssl
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
@@ -213,6 +214,11 @@ class Mesh:
             guid, connection.expected = connection.expected, None
             self.peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
             self._act()
+
+    def tls_failed(self, connection: Connection, error: ssl.SSLError) -> None:
+        """Take in an error of TLS behind its handshake, as one of the two sides saw it."""
+        failure = tls_failure(error)
+        self.refused(connection, failure.refuse, by_us=failure.by_us)
 
     def _distrusted(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
