@@ -143,8 +143,8 @@ class AgentTrust(Part):
         self.authority: MeshAuthority | None = None
         self.joins: JoinServer | None = None
         if membership.store.is_authority:
-            self.authority = MeshAuthority(membership)
-            self.joins = JoinServer(self.authority, clock, self.is_linked, bridge.counters)
+            self.authority = MeshAuthority(membership, self._is_linked)
+            self.joins = JoinServer(self.authority, clock, bridge.counters)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, random.random)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}
@@ -364,7 +364,7 @@ class AgentTrust(Part):
             return self.membership.name
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
-    def is_linked(self, name: str) -> bool:
+    def _is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
         return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
 
@@ -486,7 +486,7 @@ class TrustCommands:
         except ValueError:
             raise ConfigError("request", "is not in base64") from None
         again = str(args.get("module") or "")
-        asked, answer = self._authority().join_file(request, again, self._trust.is_linked)
+        asked, answer = self._authority().join_file(request, again)
         return {
             "module": asked.name,
             "key": asked.key_hash[: limits.FINGERPRINT_BYTES].hex(),

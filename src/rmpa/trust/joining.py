@@ -42,13 +42,11 @@ class JoinServer:
     Args:
         authority: Issues the certificates.
         clock: Monotonic seconds.
-        is_linked: Whether a member that is linked has a name.
         counters: Counts what is refused: ``trust.join_refused``, ``trust.renewal_refused``.
     """
 
     authority: MeshAuthority
     clock: SystemClock
-    is_linked: Callable[[str], bool]
     counters: Counters
 
     def __post_init__(self) -> None:
@@ -134,7 +132,7 @@ class JoinServer:
             tokens.proof_of(invitation.key, asked.request, authority.membership.files.certificate), asked.proof
         ):
             refused = tokens.JoinRefused("token", "the request is not signed with the token's key")
-        elif self.is_linked(name) or authority.has_issued(name, invitation.name):
+        elif authority.is_member(name, invitation.name):
             refused = tokens.JoinRefused(
                 "taken", f"a module named {name} is a member: choose another --name, or revoke it"
             )

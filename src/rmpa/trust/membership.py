@@ -276,13 +276,15 @@ class MeshAuthority:
 
     Args:
         membership: This module's, whose store has the CA's key, and which newer documents are given to.
+        is_linked: Whether a member that is linked has a name; by default none is, as no agent runs.
 
     Raises:
         StartError: The CA's key is another one, or a file is broken.
     """
 
-    def __init__(self, membership: Membership) -> None:
+    def __init__(self, membership: Membership, is_linked: Callable[[str], bool] = lambda _: False) -> None:
         self.membership = membership
+        self._is_linked = is_linked
         self._store = store = membership.store
         self._ca_key = private_key(store.load_ca_key(), str(store.path(CA_KEY)))
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
@@ -417,28 +419,25 @@ class MeshAuthority:
         _, certificate = self.issue(self.membership.request(hosts))
         self.membership.renewed(certificate)
 
-    def has_issued(self, name: str, again: str = "") -> bool:
-        """Whether a module of a name has a certificate that has not ended, be it present or not.
+    def is_member(self, name: str, again: str) -> bool:
+        """Whether a module of a name is linked, or has a certificate that has not ended, be it present or not.
 
         Names that differ in case alone would have the same names for browsers.
 
         Args:
             name: The name.
-            again: A module that may join again: its certificate does not count.
+            again: A module that may join again, or empty: its certificate does not count.
         """
         now, folded = self.wall(), name.casefold()
         issued = (each.name for each in self._issued.values() if each.expires > now)
-        return any(each.casefold() == folded and each != again for each in issued)
+        return self._is_linked(name) or any(each.casefold() == folded and each != again for each in issued)
 
-    def join_file(
-        self, request: bytes, again: str = "", is_linked: Callable[[str], bool] = lambda _: False
-    ) -> tuple[CertificateRequest, CertificateGrant]:
+    def join_file(self, request: bytes, again: str = "") -> tuple[CertificateRequest, CertificateGrant]:
         """The answer to a request (DER) in a join by files.
 
         Args:
             request: PKCS #10.
             again: The name of a member that may join again, as of an invitation for it.
-            is_linked: Whether a module that is linked has a name.
 
         Raises:
             ConfigError: Another member has the name.
@@ -446,7 +445,7 @@ class MeshAuthority:
         """
         asked = certificates.read_request(request)
         name = asked.name
-        if is_linked(name) or self.has_issued(name, again):
+        if self.is_member(name, again):
             text = f"a module named {name} is a member"
             remedy = f"if it is that one, and away: --module {name}; else rmpa trust revoke {name}, or another name"
             raise ConfigError("the request", text, remedy)

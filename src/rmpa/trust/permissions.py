@@ -131,22 +131,15 @@ class Permissions:
                 self._known.clear()
             known = self._known[module] = {access: [] for access in Access}
             for number, rule in enumerate(self._settings.rules, 1):
-                for access, glob, text in self._globs(number, rule, module):
-                    known[access].append((glob, PermissionDecision(rule.effect is Effect.ALLOW, text, number)))
+                askers, allowed = self._fit(rule, module), rule.effect is Effect.ALLOW
+                verb = f"{number} {'allows' if allowed else 'denies'}"
+                for key, written in _globs(rule) if askers is not None else ():
+                    text = f"[[permission]] {verb} {key} of {written!r} to {askers}"
+                    for access, glob in _accesses(key, written.replace(PEER, module)):
+                        known[access].append((glob, PermissionDecision(allowed, text, number)))
             for found in known.values():
                 found.sort(key=lambda each: each[1].allowed)  # stable: among equals the order of the file stays
         return known
-
-    def _globs(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, str, str]]:
-        """The globs of one rule, if it is about a module: the access, the glob, and the rule as text."""
-        askers = self._fit(rule, module)
-        if askers is None:
-            return
-        verb = "allows" if rule.effect is Effect.ALLOW else "denies"
-        for key, written in _globs(rule):
-            text = f"[[permission]] {number} {verb} {key} of {written!r} to {askers}"
-            for access, glob in _accesses(key, written.replace(PEER, module)):
-                yield access, glob, text
 
     def _fit(self, rule: PermissionRule, module: str) -> str | None:
         """Why a rule is about a module, as text; ``None``: it is not."""

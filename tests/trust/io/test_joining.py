@@ -67,8 +67,8 @@ class Lab:
         self.store = TrustStore(self.folder, "base")
         found_mesh(self.store, "base", "lab", WALL)
         self.base = Membership.load(self.store, self.clock)
-        self.authority = MeshAuthority(self.base)
-        self.server = JoinServer(self.authority, self.clock, self.taken.__contains__, Counters())
+        self.authority = MeshAuthority(self.base, self.taken.__contains__)
+        self.server = JoinServer(self.authority, self.clock, Counters())
 
     def invite(self, name: str = "", *, lifetime: float = 900.0) -> Token:
         return self.authority.invite(IPv4Address("127.0.0.1"), self.port, lifetime, name)
