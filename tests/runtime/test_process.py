@@ -21,10 +21,9 @@ import pytest
 
 from rmpa.core.log import configure_logging
 from rmpa.runtime import limits, loop
-from rmpa.runtime.log_writer import LogWriter
 from rmpa.runtime.loop import make_realtime
 from rmpa.runtime.programs import set_aside
-from rmpa.runtime.systemd import restart_text, watchdog_period
+from rmpa.runtime.systemd import LogWriter, restart_text, watchdog_period
 
 NOBODY: Final = 65534
 

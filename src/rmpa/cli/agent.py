@@ -31,7 +31,7 @@ from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.control import ReloadReply
 from rmpa.observe.control_client import find_agents
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.systemd import LogWriter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

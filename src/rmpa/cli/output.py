@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from typing import TextIO
 
     from rmpa.config.settings import Settings
-    from rmpa.runtime.log_writer import LogWriter
+    from rmpa.runtime.systemd import LogWriter
 
 _INDENT: Final = "    "
 # Of the levels of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.

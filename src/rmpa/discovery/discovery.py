@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.discovery import limits, network
+from rmpa.discovery.beacon import PacketFilter, Stranger
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.packet_filter import PacketFilter, Stranger
 from rmpa.runtime.loop import MachineTimer, call_at_tick, yield_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task
 

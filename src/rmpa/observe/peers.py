@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.identity import Identity
     from rmpa.core.timers import Yielder
+    from rmpa.discovery.beacon import Stranger
     from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
-    from rmpa.discovery.packet_filter import Stranger
     from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import Peer
