@@ -217,11 +217,11 @@ async def test_fence_on_an_unused_link_is_not_answered() -> None:
         sock, _ = await raw(one, HAND_MADE, lease=60.0)
         await until(lambda: bool(one.ups), "a link")
         one.ups[0].use(used=False)
-        before = one.ups[0].bytes_in
+        before = one.ups[0].info().bytes_in
         loop = asyncio.get_running_loop()
         data = pack_data_header(3, 7, 1, 0) + b"not"
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=1).serialize())
-        await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
+        await until(lambda: one.ups[0].info().bytes_in >= before + 2 * 24 + 3, "read")
         one.ups[0].use(used=True)
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=2).serialize())
         kept = b""
