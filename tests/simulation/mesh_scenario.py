@@ -99,7 +99,9 @@ class MeshScenario(Scenario):
             self._check_connections(peer, others)
             for other in (living[instance] for instance in others):
                 self._check_pair(peer, other)
-            assert all(view.run.linked for view in peer.roster.peers()), f"{peer.name} does not know its links"
+            assert all(view.run.linked for view in peer.roster.endpoints.views()), (
+                f"{peer.name} does not know its links"
+            )
 
     def _check_connections(self, peer: MeshPeer, others: list[bytes]) -> None:
         for bulk in (False, True):

@@ -36,6 +36,7 @@ from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.mesh.keepalive import rest_lease
 from rmpa.mesh.peering import REPLACED
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlServer, control_group
@@ -168,7 +169,7 @@ class NetworkEndpoint:
                     link.touch()
             case "conflict":
                 pass  # discovery has logged the error, at a bounded rate
-        self.mesh.count_peers(len(self._members))
+        self.mesh.pace.rest_lease = rest_lease(len(self._members))
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.

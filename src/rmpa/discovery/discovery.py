@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Guid, Identity
-    from rmpa.core.timers import Yielder
     from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.membership import PeerEvent
     from rmpa.discovery.network import Interface
     from rmpa.trust.packets import PacketTrust
@@ -61,6 +59,7 @@ class Discovery:
 
     Attributes:
         interfaces: The interfaces in use.
+        membership: Which peers are there.
     """
 
     def __init__(
@@ -86,11 +85,11 @@ class Discovery:
         self._on_interfaces = on_interfaces
         self._look = look
         self._resolve = resolve
-        self._membership = MembershipProtocol(
+        self.membership = MembershipProtocol(
             identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
         self._filter = PacketFilter(
-            settings.domain, self.counters, is_verified=self._membership.is_verified, trust=trust
+            settings.domain, self.counters, is_verified=self.membership.is_verified, trust=trust
         )
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
@@ -104,7 +103,7 @@ class Discovery:
         self._heartbeats: socket.socket | None = None
         self._heartbeats_tick: asyncio.TimerHandle | None = None
         self._warned: set[str] = set()
-        self._timer = MachineTimer(self._membership.next_timer, self._timer_due)
+        self._timer = MachineTimer(self.membership.next_timer, self._timer_due)
         self._started = False
         self._flushing = False
 
@@ -119,8 +118,8 @@ class Discovery:
         self._everything = self._look()
         self._use_interfaces()
         now = time.monotonic()
-        self._membership.interfaces_changed(now, self._other_addresses())
-        self._membership.start(now)
+        self.membership.interfaces_changed(now, self._other_addresses())
+        self.membership.start(now)
         self._flush()
         self._tasks = [keep_task(partial(network.watch_interfaces, self._look_again), "watch the interfaces")]
         for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
@@ -138,7 +137,7 @@ class Discovery:
         self._started = False
         await end_tasks(*self._tasks)
         self._timer.close()
-        self._membership.goodbye(time.monotonic())
+        self.membership.goodbye(time.monotonic())
         self._flush()
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._udp.fileno())
@@ -158,17 +157,13 @@ class Discovery:
             endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
                 (not the port of a connection that it dialled).
         """
-        self._membership.link_up(identity, time.monotonic(), endpoint)
+        self.membership.link_up(identity, time.monotonic(), endpoint)
         self._flush()
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._membership.link_down(guid, time.monotonic(), instance)
+        self.membership.link_down(guid, time.monotonic(), instance)
         self._flush()
-
-    def peers(self, yielder: Yielder = iter) -> list[PeerView]:
-        """All known peers, in GUID order."""
-        return self._membership.peers(yielder)
 
     def strangers(self) -> tuple[Stranger, ...]:
         """The modules that are heard and are not of this mesh."""
@@ -180,7 +175,7 @@ class Discovery:
         silent = [
             f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
             "and its UDP port open?"
-            for host, port in self._membership.silent_seeds()
+            for host, port in self.membership.silent_seeds()
             if host not in strangers
         ]
         full = self._filter.strangers_note(time.monotonic())
@@ -218,7 +213,7 @@ class Discovery:
             more = self._take(self._heartbeats, multicast=True)  # first, as they were sent before what is read now
         if sock is not self._heartbeats:
             self._take(sock, multicast=multicast)
-        elif not more and self._membership.size >= limits.HEARTBEATS_WAIT_MEMBERS:
+        elif not more and self.membership.size >= limits.HEARTBEATS_WAIT_MEMBERS:
             self._defer_heartbeats(sock)
         elif self._heartbeats_tick is not None:
             self._heartbeats_tick = None
@@ -226,7 +221,7 @@ class Discovery:
         if self._filter.overrun:
             # A flood of forged packets must not take the core: for a while they stay in the kernel's buffer.
             self.counters.add("beacon.paused")
-            self._membership.beacons_lost(time.monotonic())
+            self.membership.beacons_lost(time.monotonic())
             self._filter.overrun = False
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock.fileno())
@@ -256,7 +251,7 @@ class Discovery:
             yield_to_data()
             try:
                 data, source, index = network.receive(sock)
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 return False
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
@@ -266,9 +261,9 @@ class Discovery:
                 beacon, old_key = packet
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
                 if old_key is None:
-                    self._membership.receive(beacon, source, now, multicast=multicast)
+                    self.membership.receive(beacon, source, now, multicast=multicast)
                 else:
-                    self._membership.recognise(beacon, source, old_key)
+                    self.membership.recognise(beacon, source, old_key)
             elif self._filter.overrun:
                 return False
         return True
@@ -284,7 +279,7 @@ class Discovery:
             self._everything = everything
             self._use_interfaces()
             if self._on_interfaces(everything):
-                self._membership.interfaces_changed(time.monotonic(), self._other_addresses())
+                self.membership.interfaces_changed(time.monotonic(), self._other_addresses())
                 self._flush()
         return True
 
@@ -322,7 +317,7 @@ class Discovery:
     def _set_seeds(self) -> None:
         default = self._settings.discovery_port
         seeds = self._settings.seeds
-        self._membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
+        self.membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
     def _warn(self, text: str, code: str) -> None:
@@ -337,7 +332,7 @@ class Discovery:
         self._flushing = True
         try:
             while True:
-                outputs, events = self._membership.outputs(), self._membership.events()
+                outputs, events = self.membership.outputs(), self.membership.events()
                 if not (outputs or events):
                     break
                 for beacon, address, key in outputs:
@@ -367,5 +362,5 @@ class Discovery:
             self._sender.unicast(packet, address)
 
     def _timer_due(self, now: float) -> None:
-        self._membership.handle_timer(now)
+        self.membership.handle_timer(now)
         self._flush()

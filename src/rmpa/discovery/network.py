@@ -379,7 +379,7 @@ class Sender:
             ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, _ANY))]
             try:
                 self._sock.sendmsg([data], ancillary, 0, self._group)
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 self._counters.add("beacon.send_full")
             except OSError as error:
                 self._counters.add("beacon.send_failed")

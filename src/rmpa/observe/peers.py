@@ -130,9 +130,9 @@ class Peers:
             return (), ()
         (identity, mesh, discovery), now = endpoint, time.monotonic()
         links = {session.link.guid: session for session in self._facts.bridge.sessions.linked()}
-        roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
+        roster = {view.run.identity.guid: view for view in discovery.membership.endpoints.views(yielding_to_data)}
         yield_to_data()
-        statuses = {status.identity.guid: status for status in mesh.peers()}
+        statuses = {status.identity.guid: status for status in mesh.peering.peers()}
         known_guids = {*roster, *statuses, *links}
         infos = [
             self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now)

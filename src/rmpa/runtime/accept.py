@@ -375,7 +375,7 @@ class Acceptor:
                 return
             try:
                 sock, address = self.sock.accept()
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 return
             except OSError as error:
                 if error.errno in _GONE:

@@ -296,10 +296,7 @@ class DirectSelector(selectors.EpollSelector):
         else:
             # Rounded up, as in the base class: else the loop would wake too early for a timer, and spin.
             wait = math.ceil(timeout / _EPOLL_RESOLUTION) * _EPOLL_RESOLUTION
-        try:
-            happened = self._selector.poll(wait, max(len(self._fd_to_key), 1))
-        except InterruptedError:
-            return []
+        happened = self._selector.poll(wait, max(len(self._fd_to_key), 1))
         self.previous_poll_at, self.polled_at = self.polled_at, time.monotonic()
         ready = []
         for fd, event in self._call(happened):

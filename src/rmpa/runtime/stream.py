@@ -246,7 +246,7 @@ class Stream:
         try:
             while sent < size:
                 sent += self._sock.sendmsg(unsent(parts, sent) if sent else parts)
-        except (BlockingIOError, InterruptedError):
+        except BlockingIOError:
             pass
         except OSError as error:
             self._lost(error)
@@ -479,7 +479,7 @@ class Stream:
             return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
-        except (BlockingIOError, InterruptedError):
+        except BlockingIOError:
             return
         except OSError as error:
             self._lost(error)
@@ -561,7 +561,7 @@ class Stream:
             parts = self.outbox.head(_IOV, self._loop.time())
             try:
                 sent = self._sock.sendmsg(parts) if parts or self._secure is not None else 0
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 return
             except OSError as error:
                 self._lost(error)

@@ -203,7 +203,7 @@ async def test_status_of_an_unreachable_peer_says_why() -> None:
             ghost = Identity(Guid.of("127.255.255.254", port), b"g" * 16, "ghost")
         one.mesh.peer_found(ghost)
         await until(lambda: one.mesh.counters["link.dial_failed"] >= 2, "two attempts")
-        (status,) = one.mesh.peers()
+        (status,) = one.mesh.peering.peers()
         assert status.state in ("waiting", "dialling")
         assert "refused" in status.last_error.lower()
 

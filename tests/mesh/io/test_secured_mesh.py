@@ -40,7 +40,7 @@ def _has_all(peer: Peer) -> bool:
 
 
 def status(at: Peer, of: Peer) -> KnownPeer[PeerLink]:
-    return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
+    return next(s for s in at.mesh.peering.peers() if s.identity.guid == of.identity.guid)
 
 
 async def test_members_link_by_both_lanes_and_messages_cross(lab: Authority) -> None:
@@ -93,11 +93,11 @@ async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, b
     async with meshes(mine, judge, found=False) as (low, high):
         low.mesh.peer_found(high.identity)
         for _ in range(3):
-            await until(lambda: bool(low.mesh.peers()[0].last_error), "refused")
+            await until(lambda: bool(low.mesh.peering.peers()[0].last_error), "refused")
             assert status(low, high).last_error.startswith(f"{bad}:")
             assert status(low, high).state == "refused"
             low.mesh.peer_gone(high.identity.guid)
-            await until(lambda: not low.mesh.peers(), "forgotten")
+            await until(lambda: not low.mesh.peering.peers(), "forgotten")
             low.mesh.peer_found(high.identity)
 
 
@@ -138,10 +138,10 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
         guid = Guid.of("127.0.0.1", server.sockets[0].getsockname()[1], 0)
         arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
         await until(lambda: dials >= 3, "dialled again")
-        await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
+        await until(lambda: arm.mesh.peering.peers()[0].state == "refused", "shown")
         shown = "unsecured" if answer == TrustReason.UNSECURED else "downgrade"
-        assert arm.mesh.peers()[0].last_error.startswith(shown)
-        assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
+        assert arm.mesh.peering.peers()[0].last_error.startswith(shown)
+        assert (answer is None) != ("go away" in arm.mesh.peering.peers()[0].last_error)
 
 
 async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:

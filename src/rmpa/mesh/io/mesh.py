@@ -17,8 +17,8 @@ from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
 from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
 from rmpa.mesh.io.securing import Securing, SecuringError, tls_failure
-from rmpa.mesh.keepalive import Pace, rest_lease
-from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
+from rmpa.mesh.keepalive import Pace
+from rmpa.mesh.peering import REPLACED, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -70,6 +70,7 @@ class Mesh:
     Attributes:
         counters: Where refusals and failures are counted.
         pace: What the keepalives of all links have in common.
+        peering: All known peers: linked, or why not and when the next attempt is due.
     """
 
     def __init__(
@@ -146,14 +147,6 @@ class Mesh:
     def notes(self) -> tuple[str, ...]:
         """Problems of this module in the mesh, as texts for the user."""
         return (FULL.text,) if self.peering.left_out else ()
-
-    def count_peers(self, peers: int) -> None:
-        """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
-        self.pace.rest_lease = rest_lease(peers)
-
-    def peers(self) -> list[Peer[PeerLink]]:
-        """All known peers: linked, or why not and when the next attempt is due."""
-        return self.peering.peers()
 
     def connections(self) -> list[Connection]:
         """All connections, those without a handshake too."""
