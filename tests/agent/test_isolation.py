@@ -339,8 +339,9 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.membership.endpoints.views()) > discovery_limits.STRANGERS_MAX / 2
-    assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
+    discovery = world.near.network.endpoint.discovery
+    assert len(discovery.membership.endpoints.views()) > discovery_limits.STRANGERS_MAX / 2
+    assert discovery.counters["roster.full"] > 0
     assert world.linked()
 
 
