@@ -646,7 +646,7 @@ def test_indexes_agree_with_the_endpoints() -> None:
             one.membership.link_down(speaker.identity.guid, one.now)
         one.run(rng.choice([0.0, 0.1, 3.0]))
         one.membership.events()
-        table = one.membership._endpoints
+        table = one.membership.endpoints
         endpoints = [endpoint for _, endpoint in sorted(table.items())]
         timers = [at for endpoint in endpoints if (at := endpoint.next_timer()) is not None]
         due, first = table.timers.next(), min(timers, default=None)

@@ -292,6 +292,7 @@ class Stranger:
     heard: float
 
 
+@dataclass(eq=False)
 class PacketFilter:
     """Parses the packets of the discovery sockets; those that are dropped are counted.
 
@@ -311,19 +312,13 @@ class PacketFilter:
         overrun: Whether packets without a valid proof come faster than they can be looked at: pause the reading.
     """
 
-    def __init__(
-        self,
-        domain: int,
-        counters: Counters,
-        *,
-        is_verified: Callable[[Guid, bytes], bool] = lambda *_: False,
-        trust: PacketTrust | None = None,
-    ) -> None:
-        self._trust = trust
-        self._domain = domain
-        self._counters = counters
-        self._is_verified = is_verified
-        self._refusals = RefusalLog(_log, counters)
+    domain: int
+    counters: Counters
+    is_verified: Callable[[Guid, bytes], bool] = lambda *_: False
+    trust: PacketTrust | None = None
+
+    def __post_init__(self) -> None:
+        self._refusals = RefusalLog(_log, self.counters)
         # The limits, one for each kind of packet and each kind of sender: they are more than twelve fields together.
         self._unlinked: dict[int, TokenBucket] = {}
         self._unproved = TokenBucket(_BEACONS_UNPROVED_PER_SECOND, limits.BEACONS_UNPROVED_BURST)
@@ -356,11 +351,11 @@ class PacketFilter:
         """
         host, _ = source
         # First, where there is a proof: packets with the forged source of a member must not count as its flood.
-        if self._trust is not None:
+        if self.trust is not None:
             if len(data) > limits.BEACON_MAX_BYTES:
-                self._counters.add(MALFORMED)
+                self.counters.add(MALFORMED)
                 return None
-            proof = self._trust.verify(data, INSTANCE_AT, now)
+            proof = self.trust.verify(data, INSTANCE_AT, now)
             if proof.verdict is not Verdict.ACCEPTED:
                 return self._parse_unproved(proof, data, host, now)
         if not self._sources.take(host, now):
@@ -388,15 +383,15 @@ class PacketFilter:
     def _read(self, data: bytes, host: str, now: float, *, multicast: bool, interface: int) -> Beacon | None:
         """Parse a packet within the limits of its sender."""
         try:
-            verified = self._is_verified(*sender_of(data, self._domain))
+            verified = self.is_verified(*sender_of(data, self.domain))
             if not verified and not self._unlinked_limit(interface).take(now):
-                self._counters.add("beacon.unlinked_limited")
+                self.counters.add("beacon.unlinked_limited")
                 return None
-            packet = Beacon.parse(data, self._domain)
+            packet = Beacon.parse(data, self.domain)
         except RemoteProtocolError as error:
             counter = error.counter if isinstance(error, BeaconRefused) else MALFORMED
             if counter == OTHER_DOMAIN and multicast:
-                self._counters.add(counter)
+                self.counters.add(counter)
                 return None
             foreign = f"from {host}: {error}; is another program there?"
             text = foreign if counter == MALFORMED else f"the peer at {host} {error}"
@@ -405,7 +400,7 @@ class PacketFilter:
                 # Its name, if another release has it where this one does: a peer list without it would be a riddle.
                 self._stranger(data[:4] + bytes([VERSION]) + data[5:], str(error), now)
             return None
-        self._counters.add("beacon.in")
+        self.counters.add("beacon.in")
         return packet
 
     def _parse_unproved(
@@ -420,12 +415,12 @@ class PacketFilter:
             # One address must not use up what there is for all.
             if self._old_key_sources.take(host, now) and self._old_keys.take(now):
                 beacon = self._parsed(data)
-                self._counters.add("beacon.old_key" if beacon is not None else MALFORMED)
+                self.counters.add("beacon.old_key" if beacon is not None else MALFORMED)
                 if beacon is None:
                     return None
                 self._show(beacon, "", TrustReason.REVOKED, now)
                 return beacon, proof.key
-            self._counters.add("beacon.limited")
+            self.counters.add("beacon.limited")
         self.overrun = not self._unproved.take(now)
         if verdict is Verdict.OLD_KEY:
             return None
@@ -435,12 +430,12 @@ class PacketFilter:
             at = str(identity.guid.address)  # that of the packet is another one by each interface of a machine
             self._refusals.refuse(now, f"beacon.{verdict}", at, f"{identity.name} at {host} is {problem}")
         else:
-            self._counters.add(f"beacon.{verdict}")
+            self.counters.add(f"beacon.{verdict}")
         return None
 
     def _parsed(self, data: bytes) -> Beacon | None:
         try:
-            return Beacon.parse(data, self._domain)
+            return Beacon.parse(data, self.domain)
         except RemoteProtocolError:
             return None
 

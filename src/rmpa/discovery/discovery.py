@@ -7,6 +7,7 @@ import contextlib
 import logging
 import random
 import time
+from dataclasses import dataclass
 from functools import partial
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING, Final
@@ -41,6 +42,7 @@ _ALL_NETWORKS: Final = ""
 _ALONE: Final = "no interface that can carry multicast is up: other machines are only found by --seed"
 
 
+@dataclass(eq=False)
 class Discovery:
     """Finds the other agents of the domain, and makes this one known to them.
 
@@ -62,38 +64,27 @@ class Discovery:
         membership: Which peers are there.
     """
 
-    def __init__(
-        self,
-        identity: Identity,
-        settings: Settings,
-        udp_socket: socket.socket,
-        *,
-        on_event: Callable[[PeerEvent], None],
-        on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
-        look: Callable[[], tuple[Interface, ...]] = network.list_interfaces,
-        resolve: Callable[[str], list[str]] = network.resolve_ipv4,
-        trust: PacketTrust | None = None,
-    ) -> None:
-        self._trust = trust
+    identity: Identity
+    settings: Settings
+    udp_socket: socket.socket
+    on_event: Callable[[PeerEvent], None]
+    on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True
+    look: Callable[[], tuple[Interface, ...]] = network.list_interfaces
+    resolve: Callable[[str], list[str]] = network.resolve_ipv4
+    trust: PacketTrust | None = None
+
+    def __post_init__(self) -> None:
+        settings = self.settings
         self.counters = Counters()
         self.interfaces: tuple[Interface, ...] = ()
-        self._identity = identity
-        self._settings = settings
-        self._udp = udp_socket
-        network.enlarge_buffer(udp_socket)
-        self._on_event = on_event
-        self._on_interfaces = on_interfaces
-        self._look = look
-        self._resolve = resolve
+        network.enlarge_buffer(self.udp_socket)
         self.membership = MembershipProtocol(
-            identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
+            self.identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
-        self._filter = PacketFilter(
-            settings.domain, self.counters, is_verified=self.membership.is_verified, trust=trust
-        )
+        self._filter = PacketFilter(settings.domain, self.counters, self.membership.is_verified, self.trust)
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
-        self._sender = network.Sender(udp_socket, self._group, self.counters)
+        self._sender = network.Sender(self.udp_socket, self._group, self.counters)
         self._everything: tuple[Interface, ...] = ()
         self._seed_hosts: dict[str, list[str]] = {}
         self._tasks: list[asyncio.Task[None]] = []
@@ -110,23 +101,23 @@ class Discovery:
     async def start(self) -> None:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
-        self._listen(self._udp, multicast=False)
+        self._listen(self.udp_socket, multicast=False)
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
-        if self._settings.multicast.enabled:
+        if self.settings.multicast.enabled:
             self._open_group()
-        self._everything = self._look()
+        self._everything = self.look()
         self._use_interfaces()
         now = time.monotonic()
         self.membership.interfaces_changed(now, self._other_addresses())
         self.membership.start(now)
         self._flush()
         self._tasks = [keep_task(partial(network.watch_interfaces, self._look_again), "watch the interfaces")]
-        for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
+        for host in dict.fromkeys(seed.host for seed in self.settings.seeds):
             try:
                 self._seed_hosts[host] = [str(IPv4Address(host))]
             except AddressValueError:
-                follow = partial(network.follow_seed, host, self._resolve, self._seed_is)
+                follow = partial(network.follow_seed, host, self.resolve, self._seed_is)
                 self._tasks.append(keep_task(follow, f"follow seed {host}"))
         self._set_seeds()
 
@@ -140,7 +131,7 @@ class Discovery:
         self.membership.goodbye(time.monotonic())
         self._flush()
         loop = asyncio.get_running_loop()
-        loop.remove_reader(self._udp.fileno())
+        loop.remove_reader(self.udp_socket.fileno())
         for sock in self._receivers:
             loop.remove_reader(sock.fileno())
             sock.close()
@@ -173,7 +164,7 @@ class Discovery:
         """Problems of the network, as texts for the user."""
         strangers = {host for one in self.strangers() for host, _ in one.identity.endpoints}
         silent = [
-            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
+            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self.settings.domain} too, "
             "and its UDP port open?"
             for host, port in self.membership.silent_seeds()
             if host not in strangers
@@ -271,30 +262,30 @@ class Discovery:
     def _look_again(self) -> bool:
         """Act on a change of the interfaces; return whether they could be listed."""
         try:
-            everything = self._look()
+            everything = self.look()
         except OSError as error:  # no file descriptor is left to ask the kernel
             _log.debug("! interfaces cannot be listed: %s", error)
             return False
         if everything != self._everything:
             self._everything = everything
             self._use_interfaces()
-            if self._on_interfaces(everything):
+            if self.on_interfaces(everything):
                 self.membership.interfaces_changed(time.monotonic(), self._other_addresses())
                 self._flush()
         return True
 
     def _other_addresses(self) -> tuple[IPv4Address, ...]:
-        wanted = self._settings.interfaces
+        wanted = self.settings.interfaces
         mine = [i for i in self._everything if i.up and (not wanted or i.name in wanted)]
-        return network.further_addresses(mine, self._identity.guid.address)
+        return network.further_addresses(mine, self.identity.guid.address)
 
     def _use_interfaces(self) -> None:
         """Choose the usable interfaces, and join the group on them."""
-        wanted = self._settings.interfaces
+        wanted = self.settings.interfaces
         before, self.interfaces = self.interfaces, network.choose(self._everything, wanted)
         if problem := network.unknown_names(self._everything, wanted):
             self._warn(problem, "no-interface")
-        if not self._settings.multicast.enabled:
+        if not self.settings.multicast.enabled:
             return
         if self.interfaces != before:
             _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self.interfaces)) or "no interface")
@@ -315,8 +306,8 @@ class Discovery:
             self._set_seeds()
 
     def _set_seeds(self) -> None:
-        default = self._settings.discovery_port
-        seeds = self._settings.seeds
+        default = self.settings.discovery_port
+        seeds = self.settings.seeds
         self.membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
@@ -343,7 +334,7 @@ class Discovery:
                     if event.change == "conflict":
                         host = str(event.identity.guid.address)
                         self._refusals.refuse(time.monotonic(), f"conflict.{event.reason}", host, event.text)
-                    self._on_event(event)
+                    self.on_event(event)
         finally:
             self._flushing = False
             if self._started:
@@ -352,8 +343,8 @@ class Discovery:
     def _send(self, beacon: Beacon, address: Address | None, key: int) -> None:
         """Send a beacon, signed in a secured mesh; the arguments as for ``endpoints.OutgoingBeacon``."""
         packet = beacon.serialize()
-        if self._trust is not None:
-            packet = self._trust.sign(packet, time.monotonic(), key)
+        if self.trust is not None:
+            packet = self.trust.sign(packet, time.monotonic(), key)
         if address is None:
             _log.debug("> group: %s", beacon)
             self._sender.multicast(packet, self.interfaces)

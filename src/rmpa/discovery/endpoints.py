@@ -440,6 +440,7 @@ class OutgoingBeacon(NamedTuple):
     key: int = 0
 
 
+@dataclass(eq=False)
 class BeaconSender:
     """Numbers the beacons of one agent and puts gossip into them. It decides nothing about when one is sent.
 
@@ -453,12 +454,13 @@ class BeaconSender:
         closed: Whether nothing is sent any more: a goodbye was the last beacon.
     """
 
-    def __init__(self, identity: Identity, endpoints: EndpointTable, counters: Counters, *, multicast: bool) -> None:
-        self.identity = identity
-        self.multicast = multicast
+    identity: Identity
+    endpoints: EndpointTable
+    counters: Counters
+    multicast: bool
+
+    def __post_init__(self) -> None:
         self.closed = False
-        self._endpoints = endpoints
-        self._counters = counters
         self._sequence = 0
         self._turn = 0
         self._answers = TokenBucket(limits.ANSWERS_PER_SECOND, limits.ANSWERS_PER_SECOND)
@@ -489,10 +491,10 @@ class BeaconSender:
             if self._answers.has(now) and self._answered.take(address, now):
                 self._answers.spend()
                 if gossip is None:
-                    gossip = self.gossip(self.heard_lately(self._endpoints.members.values(), now), peer)
+                    gossip = self.gossip(self.heard_lately(self.endpoints.members.values(), now), peer)
                 self.send(BeaconKind.ANSWER, address, gossip)
             else:
-                self._counters.add("beacon.answer_limited")
+                self.counters.add("beacon.answer_limited")
 
     def send_goodbye(self, peers: Iterable[PeerInstance]) -> None:
         """Send a goodbye to the group, and to these peers by unicast; afterwards nothing is sent."""
@@ -532,7 +534,7 @@ class BeaconSender:
 
     def unheard_by_multicast(self, now: float) -> list[PeerInstance]:
         """Members that get their heartbeats by unicast, because no multicast of theirs was heard lately."""
-        members = self._endpoints.members
+        members = self.endpoints.members
         if not self.multicast:
             return list(members.values())
         since = now - limits.MULTICAST_SILENCE
@@ -541,5 +543,5 @@ class BeaconSender:
 
     def _observed(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
         """Source addresses of gossiped peers that differ from the GUID's address, which may not be reachable."""
-        sources = [(guid, peer.source) for guid in gossip if (peer := self._endpoints.members.get(guid.place))]
+        sources = [(guid, peer.source) for guid in gossip if (peer := self.endpoints.members.get(guid.place))]
         return tuple(at for guid, at in sources if at and at != guid.endpoint and not at[0].startswith("127."))

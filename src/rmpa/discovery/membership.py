@@ -117,7 +117,7 @@ class MembershipProtocol:
         self.counters = counters if counters is not None else Counters()
         self._rng = rng
         self.endpoints = EndpointTable()
-        self._sender = BeaconSender(identity, self.endpoints, self.counters, multicast=multicast)
+        self._sender = BeaconSender(identity, self.endpoints, self.counters, multicast)
         self._candidates = GossipCandidates(rng)
         self._reported_names: set[frozenset[bytes]] = set()
         self._seeds: tuple[Address, ...] = ()

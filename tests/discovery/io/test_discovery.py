@@ -281,7 +281,7 @@ async def test_events_may_call_back(agents: list[Agent], settings: Settings) -> 
         if event.change == "found":
             base.discovery.link_up(event.identity)
 
-    base.discovery._on_event = link
+    base.discovery.on_event = link
     await start(agents, base, pc)
     await until(lambda: base.names() and base.view("pc").run.linked)
 

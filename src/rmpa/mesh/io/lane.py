@@ -12,6 +12,7 @@ import errno
 import os
 import socket
 import struct
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
@@ -123,6 +124,7 @@ def _try(sock: socket.socket, name: int, value: int | bytes, level: int = socket
     return True
 
 
+@dataclass(eq=False)
 class Dialler:
     """Opens the TCP connections that this side dials.
 
@@ -131,9 +133,8 @@ class Dialler:
         counters: Where options that the system refuses are counted.
     """
 
-    def __init__(self, lanes: LaneSettings, counters: Counters) -> None:
-        self._lanes = lanes
-        self._counters = counters
+    lanes: LaneSettings
+    counters: Counters
 
     def tune(self, sock: socket.socket, lane: int) -> None:
         """Set up the socket of a lane.
@@ -147,7 +148,7 @@ class Dialler:
 
         An option that the system refuses only costs quality of service: it is counted as ``link.option_refused``.
         """
-        express, lanes = lane != Lane.BULK, self._lanes
+        express, lanes = lane != Lane.BULK, self.lanes
         unsent = EXPRESS_UNSENT_BYTES if express else BULK_UNSENT_BYTES
         priority = lanes.express_priority if express else lanes.bulk_priority
         options = (
@@ -159,7 +160,7 @@ class Dialler:
         )
         for level, name, value in options:
             if not _try(sock, name, value, level):
-                self._counters.add("link.option_refused")
+                self.counters.add("link.option_refused")
         for name, quick, usual in _REPETITION:
             _try(sock, name, quick if express else usual)
         if not express:
@@ -179,7 +180,7 @@ class Dialler:
             # Both sides send packets that fit through usual tunnels, whatever the path's MTU is.
             segment = _SEGMENT_BYTES + _TIME_STAMP_BYTES
             if not endpoint[0].startswith("127.") and not _try(sock, socket.TCP_MAXSEG, segment):
-                self._counters.add("link.option_refused")
+                self.counters.add("link.option_refused")
             async with asyncio.timeout(within):
                 await asyncio.get_running_loop().sock_connect(sock, endpoint)
         except BaseException:
