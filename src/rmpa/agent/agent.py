@@ -111,7 +111,6 @@ class NetworkEndpoint:
         bridge.place(self.identity)
         if trust is not None:
             trust.identity = self.identity
-        self._members: set[Guid] = set()
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -155,13 +154,11 @@ class NetworkEndpoint:
         match event.change:
             case "found":
                 _log.info("+ %s found", identity)
-                self._members.add(identity.guid)
                 self.mesh.peer_found(identity, event.source[0] if event.source else None)
             case "changed":
                 self.mesh.peer_found(identity)
             case "lost":
                 _log.info("- %s %s", identity, event.reason)
-                self._members.discard(identity.guid)
                 self.mesh.peer_gone(identity.guid)
             case "doubted":
                 # A link at rest would notice after many seconds that its peer is gone.
@@ -169,7 +166,7 @@ class NetworkEndpoint:
                     link.touch()
             case "conflict":
                 pass  # discovery has logged the error, at a bounded rate
-        self.mesh.pace.rest_lease = rest_lease(len(self._members))
+        self.mesh.pace.rest_lease = rest_lease(self.discovery.membership.size)
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
