@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from types import SimpleNamespace
 from unittest import mock
 
 from rmpa.mesh import limits
@@ -51,7 +52,9 @@ class MeshScenario(Scenario):
     def simulated(self) -> Iterator[None]:
         """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
+        clocks = SimpleNamespace(monotonic=lambda: self.world.now, time_ns=self.world.time_ns)
         with (
+            mock.patch("rmpa.runtime.loop.time", clocks),
             mock.patch("rmpa.runtime.stream.Stream.unacknowledged", property(lambda stream: stream._sock.in_flight)),
             mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
