@@ -123,7 +123,6 @@ class NetworkEndpoint:
                 bridge.sessions.lane_lost,
             ),
             lanes=settings.lanes,
-            clock=clock,
             security=trust.membership if trust is not None else None,
             on_join=trust.joins.serve if trust is not None and trust.joins is not None else None,
         )

@@ -61,7 +61,6 @@ class Mesh:
         listen_socket: Bound and listening, non-blocking; owned by the mesh from here on.
         handlers: What is called when something happens to a link.
         lanes: The options of the lanes' sockets.
-        clock: The time; its ``now`` must be the loop's own clock.
         rng: Uniform numbers in [0, 1), for jitter.
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
@@ -80,14 +79,13 @@ class Mesh:
         handlers: LinkHandlers,
         *,
         lanes: LaneSettings | None = None,
-        clock: SystemClock | None = None,
         rng: Callable[[], float] = random.random,
         dialler: Dialler | None = None,
         security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
         self.identity, self.handlers, self.rng = identity, handlers, rng
-        self.clock, self.counters, self.pace = clock or SystemClock(), Counters(), Pace.of(identity)
+        self.clock, self.counters, self.pace = SystemClock(), Counters(), Pace.of(identity)
         self.acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self.refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
