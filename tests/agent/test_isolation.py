@@ -310,7 +310,7 @@ async def many_peers_shout(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.peers()) > 25
+    assert len(world.near.network.endpoint.discovery.membership.endpoints.views()) > 25
 
 
 async def thousands_of_peers_are_invented(world: World) -> None:
@@ -339,8 +339,9 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.peers()) > discovery_limits.STRANGERS_MAX / 2
-    assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
+    discovery = world.near.network.endpoint.discovery
+    assert len(discovery.membership.endpoints.views()) > discovery_limits.STRANGERS_MAX / 2
+    assert discovery.counters["roster.full"] > 0
     assert world.linked()
 
 

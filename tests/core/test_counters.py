@@ -100,7 +100,7 @@ def test_text(stream: io.StringIO) -> None:
 
 def test_a_journal_gets_priorities_and_no_time(stream: io.StringIO) -> None:
     configure_logging("debug", stream, as_json=False, in_journal=True)
-    log = logging.getLogger("rmpa.mesh.io.dial")
+    log = logging.getLogger("rmpa.mesh.io.lane")
     log.debug("> a")
     log.warning("! b")
     try:

@@ -16,7 +16,7 @@ from rmpa.discovery.membership import BURST_OFFSETS
 from tests.discovery.test_membership import Harness
 
 if TYPE_CHECKING:
-    from rmpa.discovery.announcing import OutgoingBeacon
+    from rmpa.discovery.endpoints import OutgoingBeacon
 
 MEMBERS = 1000
 
@@ -64,7 +64,7 @@ def test_a_thousand_agents_that_start_at_once_do_not_answer_each_other() -> None
         for number in range(MEMBERS):
             agent.hears(number, BeaconKind.ANNOUNCE)
     sent += agent.run(3.0)
-    assert len(agent.membership.peers()) == MEMBERS
+    assert len(agent.membership.endpoints.views()) == MEMBERS
     assert len(answers(sent)) <= (limits.MANY_MEMBERS + 1) * len(BURST_OFFSETS)
     assert len(multicasts(sent)) <= len(BURST_OFFSETS) + 1
 

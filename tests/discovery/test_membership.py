@@ -13,15 +13,22 @@ import pytest
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.discovery import limits, membership
-from rmpa.discovery.announcing import CANDIDATE_LIFETIME, CANDIDATE_RETRY_MAX, CANDIDATES_BURST, CANDIDATES_PER_SECOND
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.discovery.endpoints import GOODBYE_LATE, LEASE_MAX, LEASE_MIN
+from rmpa.discovery.endpoints import (
+    CANDIDATE_LIFETIME,
+    CANDIDATE_RETRY_MAX,
+    CANDIDATES_BURST,
+    CANDIDATES_PER_SECOND,
+    GOODBYE_LATE,
+    LEASE_MAX,
+    LEASE_MIN,
+)
 from rmpa.discovery.membership import BURST_AGAIN_OFFSETS, BURST_JITTER, BURST_OFFSETS, MembershipProtocol, PeerEvent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.discovery.announcing import OutgoingBeacon
+    from rmpa.discovery.endpoints import OutgoingBeacon
 
 T0 = 1000.0
 
@@ -70,7 +77,7 @@ class Harness:
         return sent
 
     def present(self) -> list[str]:
-        return [view.run.identity.name for view in self.membership.peers() if view.present]
+        return [view.run.identity.name for view in self.membership.endpoints.views() if view.present]
 
 
 @pytest.fixture
@@ -159,7 +166,7 @@ def test_a_recognised_module_is_told_where_we_are_and_changes_nothing(one: Harne
     one.hear(Speaker(who(2))())
     one.run(1.0)
     one.membership.events()
-    before, liars = deepcopy(one.membership.peers()), [Speaker(who(n), 1 << 20) for n in range(2, 100)]
+    before, liars = deepcopy(one.membership.endpoints.views()), [Speaker(who(n), 1 << 20) for n in range(2, 100)]
     for liar in liars:
         for kind in BeaconKind:
             one.membership.recognise(liar(kind, who(200).guid), ("10.0.0.99", 4000), 7)
@@ -168,7 +175,7 @@ def test_a_recognised_module_is_told_where_we_are_and_changes_nothing(one: Harne
     for output in sent:
         assert output.address
         assert (output.beacon.kind, output.beacon.gossip, output.key) == (BeaconKind.ANSWER, (), 7)
-    assert one.membership.peers() == before
+    assert one.membership.endpoints.views() == before
     assert one.membership.events() == []
 
 
@@ -232,7 +239,7 @@ def test_a_forged_goodbye_of_a_linked_peer_is_forgotten_with_its_next_heartbeat(
 
 def test_a_stranger_that_says_goodbye_is_not_met(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.GOODBYE))
-    assert (one.membership.events(), one.membership.outputs(), one.membership.peers()) == ([], [], [])
+    assert (one.membership.events(), one.membership.outputs(), one.membership.endpoints.views()) == ([], [], [])
 
 
 def test_we_say_goodbye_and_nothing_after_it(one: Harness) -> None:
@@ -253,7 +260,7 @@ def test_a_link_of_a_replaced_run_that_falls_late_changes_nothing(one: Harness) 
     one.membership.link_up(who(2, 2), one.now)
     assert [e.change for e in one.membership.events()] == ["found", "lost", "found"]
     one.membership.link_down(who(2).guid, one.now, who(2).instance)
-    assert one.membership.peers()[0].run.linked
+    assert one.membership.endpoints.views()[0].run.linked
 
 
 def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
@@ -281,7 +288,7 @@ def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness)
     assert "two live peers share one GUID address 10.0.0.2:40002" in text
     assert "--port" in text
     assert "NAT" in text
-    views = one.membership.peers()
+    views = one.membership.endpoints.views()
     assert {v.run.identity.name for v in views} == {"left", "right"}
     assert all(v.conflicts for v in views)
     for _ in range(6):
@@ -356,9 +363,9 @@ def test_somebody_else_with_our_guid(one: Harness) -> None:
         one.run(5)
         one.hear(twin())
     assert one.membership.events() == []
-    assert [v.run.identity.name for v in one.membership.peers()] == ["twin"]
+    assert [v.run.identity.name for v in one.membership.endpoints.views()] == ["twin"]
     one.run(20)
-    assert one.membership.peers() == []
+    assert one.membership.endpoints.views() == []
 
 
 def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> None:
@@ -375,7 +382,7 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
         )
     ]
     assert one.present() == ["base", "base"]
-    assert all("rename one" in view.conflicts[0] for view in one.membership.peers())
+    assert all("rename one" in view.conflicts[0] for view in one.membership.endpoints.views())
 
 
 def moved(identity: Identity, port: int) -> Identity:
@@ -403,7 +410,7 @@ def test_name_conflict_needs_proof_that_both_are_alive(one: Harness) -> None:
     one.run(1)
     one.hear(second())
     assert not [e for e in one.membership.events() if e.change == "conflict"]
-    assert not any(view.conflicts for view in one.membership.peers())
+    assert not any(view.conflicts for view in one.membership.endpoints.views())
     one.run(1)
     one.hear(first())
     assert [e.reason for e in one.membership.events() if e.change == "conflict"] == ["name"]
@@ -430,7 +437,7 @@ def test_a_handshake_without_addresses_changes_nothing(one: Harness) -> None:
     one.membership.events()
     one.membership.link_up(who(2), one.now)
     assert one.membership.events() == []
-    assert one.membership.peers()[0].run.identity == full
+    assert one.membership.endpoints.views()[0].run.identity == full
 
 
 def test_gossip_leads_to_announcements_that_end(one: Harness) -> None:
@@ -538,7 +545,7 @@ def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
     for i in range(2 * limits.STRANGERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
-    assert len(one.membership.peers()) == limits.STRANGERS_MAX
+    assert len(one.membership.endpoints.views()) == limits.STRANGERS_MAX
     assert one.membership.counters["roster.full"]
     for i in range(core_limits.PEERS_MAX):
         guid = Guid.of(IPv4Address(0x0A020000 + i), 4000)
@@ -546,7 +553,7 @@ def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
         one.membership.link_up(linked, one.now)
     assert "linked3" in one.present()
     assert not any(name.startswith("n") for name in one.present())
-    assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
+    assert len(one.membership.endpoints.views()) == core_limits.PEERS_MAX - 1
 
 
 # --- rosters full of peers that somebody invents -----------------------------------------------------------------
@@ -639,7 +646,7 @@ def test_indexes_agree_with_the_endpoints() -> None:
             one.membership.link_down(speaker.identity.guid, one.now)
         one.run(rng.choice([0.0, 0.1, 3.0]))
         one.membership.events()
-        table = one.membership._endpoints
+        table = one.membership.endpoints
         endpoints = [endpoint for _, endpoint in sorted(table.items())]
         timers = [at for endpoint in endpoints if (at := endpoint.next_timer()) is not None]
         due, first = table.timers.next(), min(timers, default=None)

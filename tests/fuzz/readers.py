@@ -45,6 +45,7 @@ from rmpa.trust.tokens import (
     decode_message,
     encode_message,
 )
+from tests.mesh.worlds import with_peer
 from tests.ros.documents import parse_call, serialize_call
 
 _BASE: Final = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -164,7 +165,7 @@ def _hello(data: bytes) -> Hello:
 
 
 def _check_hello(hello: Hello) -> None:
-    verdict = judge(hello, _OURS, _BASE)
+    verdict = judge(hello, _OURS, with_peer(_BASE, dialled=False))
     judge_welcome(hello, _OURS, _BASE.guid)
     assert verdict is not None or hello.identity.guid == hello.guid, "a welcome peer has no identity"
     assert hello.lease > 0

@@ -34,10 +34,10 @@ from rmpa.ros.core import state as core_state
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.master.registrations import NodeRecord
 from rmpa.ros.types.descriptor import Descriptor
-from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, ca_public_key, read_document, verify
+from rmpa.trust.certificates import DenyEntry, DenyList, KeyList, ca_public_key, read_certificate, read_document
 from rmpa.trust.packets import Verdict
 from rmpa.trust.store import AuthorityPlace, Issued, TrustStore
-from rmpa.trust.tokens import Invitation, Token, TokenBook, decode_message
+from rmpa.trust.tokens import Invitation, Token, decode_message
 from rmpa.web.server.access import token_from
 from tests.bridge import test_messages
 from tests.discovery.test_beacon import BEACON
@@ -48,7 +48,6 @@ from tests.mesh.worlds import ACCEPTOR, DIALLER, HIGH, LOW, Side, Time, deliver
 from tests.observe.samples import SNAPSHOT
 from tests.resource import test_saved
 from tests.trust import test_packets, test_tokens
-from tests.trust.authority import WALL
 from tests.trust.io.member_files import KEYS, SecuredMesh
 
 if TYPE_CHECKING:
@@ -177,7 +176,7 @@ def write_state(place: Path) -> None:
     """A state directory as this release writes it."""
     mesh = SecuredMesh(place, deny=DENIED)
     store = mesh.save(MODULE)
-    store.save_tokens(TokenBook([INVITED]))
+    store.save_tokens([INVITED])
     store.save_issued([ISSUED])
     store.save_authority(AUTHORITY)
     kept = {
@@ -213,10 +212,10 @@ def check_state(place: Path) -> None:
     store = TrustStore(place, MODULE)
     files = store.load()
     authority = ca_public_key(files.ca)
-    assert verify(files.certificate, files.ca, WALL).name == MODULE
+    assert read_certificate(files.certificate, files.ca).name == MODULE
     assert read_document(files.keys, authority, KeyList) == KEYS
     assert read_document(files.deny, authority, DenyList) == DENIED
-    assert store.load_tokens().invitations == (INVITED,)
+    assert store.load_tokens() == [INVITED]
     assert store.load_issued() == {"arm": ISSUED}
     assert store.load_authority() == AUTHORITY
 

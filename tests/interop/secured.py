@@ -48,7 +48,7 @@ class SecuredMesh:
 
     def _authority(self) -> MeshAuthority:
         store = self.store(self.authority)
-        return MeshAuthority(Membership.load(store, SystemClock(), time.time))
+        return MeshAuthority(Membership.load(store, SystemClock()))
 
     def add(self, *names: str) -> None:
         """Make modules members, as a join does, before their agents run."""

@@ -28,7 +28,7 @@ from rmpa.mesh.frames import (
     parse_text,
     pong,
 )
-from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, pass_time
+from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, pass_time, with_peer
 
 # Frames: golden bytes, whole, byte by byte, malformed, any.
 
@@ -233,7 +233,7 @@ REFUSED: list[tuple[Hello, Identity | None, Refusal, str]] = [
 
 @pytest.mark.parametrize(("hello", "linked", "code", "advice"), REFUSED)
 def test_refused(hello: Hello, linked: Identity | None, code: Refusal, advice: str) -> None:
-    verdict = judge(hello, HIGH, linked)
+    verdict = judge(hello, HIGH, None if linked is None else with_peer(linked, dialled=False))
     assert verdict is not None
     assert verdict.code == code
     assert advice in verdict.text
@@ -244,16 +244,18 @@ def test_a_full_mesh_refuses_strangers_alone() -> None:
     assert verdict is not None
     assert verdict.code == Refusal.FULL
     assert "docs/guides/sites.md" in verdict.text
-    assert judge(hello_of(LOW), HIGH, LOW, full=True) is None
+    assert judge(hello_of(LOW), HIGH, with_peer(LOW), full=True) is None
 
 
 def test_welcome_cases() -> None:
     assert judge(hello_of(LOW, HIGH.guid), HIGH) is None
     older = Guid.of(HIGH.guid.address, HIGH.guid.port, 0)
     assert judge(hello_of(LOW, older), HIGH) is None, "a restarted peer is welcome under its old number"
-    assert judge(hello_of(LOW), HIGH, GHOST, alive=False) is None, "the ghost of a new instance"
-    assert judge(hello_of(LOW), HIGH, LOW, dialled=True) is None, "the lower GUID's call replaces ours"
-    verdict = judge(hello_of(HIGH), LOW, HIGH, dialled=True)
+    assert judge(hello_of(LOW), HIGH, with_peer(GHOST, dialled=False, alive=False)) is None, (
+        "the ghost of a new instance"
+    )
+    assert judge(hello_of(LOW), HIGH, with_peer(LOW)) is None, "the lower GUID's call replaces ours"
+    verdict = judge(hello_of(HIGH), LOW, with_peer(HIGH))
     assert verdict is not None
     assert verdict.code == Refusal.ALREADY_LINKED
 

@@ -12,20 +12,20 @@ from rmpa.core.identity import Guid, Identity
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Hello, Refusal, Refuse
 from rmpa.mesh.peering import LINK_STABLE, REFUSED_RETRY, Peering, PeeringOutput
-from tests.mesh.worlds import HIGH, LOW
+from tests.mesh.worlds import HIGH, LOW, Known, with_peer
 
 AGAIN = Identity(Guid.of("10.0.0.2", 40002, 2), b"A" * 16, "high")
 
 
-def of(ours: Identity, *, alive: bool = True) -> Peering:
-    return Peering(ours, rng=lambda: 0.999999, alive=lambda _: alive)
+def of(ours: Identity) -> Peering[Known]:
+    return Peering(ours, rng=lambda: 0.999999)
 
 
-def dials(outputs: list[PeeringOutput]) -> list[tuple[str, int]]:
+def dials(outputs: list[PeeringOutput[Known]]) -> list[tuple[str, int]]:
     return [dial[2][0] for dial in outputs if dial[0] == "dial"]
 
 
-def until_dial(peering: Peering, now: float) -> tuple[float, tuple[str, int]]:
+def until_dial(peering: Peering[Known], now: float) -> tuple[float, tuple[str, int]]:
     while not (made := dials(peering.take())):
         due = peering.next_timer()
         assert due is not None
@@ -38,14 +38,15 @@ def dialled_after_silence(
     count: int, *, needed: bool = True, seconds: float = 12.0
 ) -> list[tuple[float, tuple[Guid, bool]]]:
     """The dials to peers whose links fell silent at 0 s; each of them fails after ``limits.REDIAL_TIMEOUT``."""
-    peering = of(LOW)
+    peering, links = of(LOW), []
     for number in range(1, count + 1):
         identity = Identity(Guid.of(f"10.1.{number}.2", 40002), bytes([number]) * 16, f"peer{number}")
+        links.append(with_peer(identity))
         peering.peer_found(identity, -100.0)
-        peering.link_up(number, identity, -99.0, dialled=True, endpoint=identity.guid.endpoint)
+        peering.link_up(links[-1], -99.0)
     peering.take()
-    for number in range(1, count + 1):
-        peering.link_down(number, "silent", 0.0, silent=True, needed=needed)
+    for link in links:
+        peering.link_down(link, "silent", 0.0, silent=True, needed=needed)
     made: list[tuple[float, tuple[Guid, bool]]] = []
     failing: list[tuple[float, tuple[Guid, bool]]] = []
     for now in (tick / 100 for tick in range(round(100 * seconds))):
@@ -68,6 +69,30 @@ def test_a_needed_peer_that_fell_silent_is_dialled_by_short_attempts() -> None:
     assert not any(briefly for _, (_, briefly) in dialled_after_silence(1, needed=False))
 
 
+def test_a_silent_link_is_replaced_by_a_new_connection_on_any_path() -> None:
+    """Each attempt is short; the next one follows while the link is silent, and none once it is heard again."""
+    low, link = of(LOW), with_peer(HIGH)
+    low.peer_found(HIGH, 0.0, "10.9.0.2")
+    low.link_up(link, 0.0)
+    low.take()
+    link.alive, link.stuck = False, True
+    low.link_silent(link)
+    low.link_silent(link)
+    endpoints = (HIGH.guid.endpoint, ("10.9.0.2", HIGH.guid.port))
+    assert low.take() == [("dial", HIGH.guid, endpoints, True)]
+    low.dial_failed(HIGH.guid, "no answer", 1.0)
+    assert until_dial(low, 1.0)[0] == 1.0 + limits.REDIAL_PAUSE
+    assert low.dial_opened(HIGH.guid, 1.1)
+    link.stuck = False
+    assert not low.dial_opened(HIGH.guid, 1.2), "it waits for nothing"
+    low.link_silent(link)
+    link.alive = True
+    low.take()
+    low.dial_failed(HIGH.guid, "no answer", 2.0)
+    assert low.next_timer() is None
+    assert (low.peers()[0].state, low.peers()[0].last_error) == ("linked", "")
+
+
 def test_retries_for_ever_with_a_cap() -> None:
     low = of(LOW)
     low.peer_found(HIGH, 0.0)
@@ -85,12 +110,12 @@ def test_flapping_link_is_dialled_slower_than_a_stable_one() -> None:
     low = of(LOW)
     low.peer_found(HIGH, 0.0)
     now, before, pauses = 0.0, 0.0, []
-    for link in range(1, 9):
+    for number in range(1, 9):
         before = now
         now, _ = until_dial(low, now)
         pauses.append(now - before)
-        low.link_up(link, HIGH, now, dialled=True, endpoint=HIGH.guid.endpoint)
-        now += 0.01 if link < 7 else LINK_STABLE
+        low.link_up(link := with_peer(HIGH), now)
+        now += 0.01 if number < 7 else LINK_STABLE
         low.link_down(link, "lost", now)
     assert pauses[5] > 1.0
     now, _ = until_dial(low, now)
@@ -98,11 +123,11 @@ def test_flapping_link_is_dialled_slower_than_a_stable_one() -> None:
 
 
 def test_unannounced_peer_is_forgotten_after_its_link() -> None:
-    low = of(LOW)
-    low.link_up(7, HIGH, 0.0, dialled=False)
-    assert low.take() == [("up", 7)]
-    low.link_down(7, "lost", 10.0)
-    assert low.take() == [("down", 7, "lost")]
+    low, link = of(LOW), with_peer(HIGH, dialled=False)
+    low.link_up(link, 0.0)
+    assert low.take() == [("up", link)]
+    low.link_down(link, "lost", 10.0)
+    assert low.take() == [("down", link, "lost")]
     now = 10.0
     while (due := low.next_timer()) is not None:
         now = due
@@ -136,28 +161,28 @@ def test_lasting_refusal_is_reported_once_and_retried_slowly(code: Refusal) -> N
 
 
 def test_a_new_instance_replaces_its_ghost() -> None:
-    low = of(LOW)
+    low, ghost, link = of(LOW), with_peer(HIGH), with_peer(AGAIN)
     low.peer_found(HIGH, 0.0)
-    low.link_up(1, HIGH, 0.0, dialled=True, endpoint=HIGH.guid.endpoint)
+    low.link_up(ghost, 0.0)
     low.take()
     low.peer_found(AGAIN, 1.0)
     assert low.take() == [
-        ("close", 1, "the peer restarted"),
-        ("down", 1, "the peer restarted"),
+        ("close", ghost, "the peer restarted"),
+        ("down", ghost, "the peer restarted"),
         ("dial", AGAIN.guid, AGAIN.endpoints, False),
     ]
-    low.link_up(2, AGAIN, 1.1, dialled=True, endpoint=AGAIN.guid.endpoint)
-    assert low.take() == [("up", 2)]
+    low.link_up(link, 1.1)
+    assert low.take() == [("up", link)]
     low.peer_found(HIGH, 1.2)
     low.peer_gone(HIGH.guid)
-    low.link_down(1, "late", 1.4)
+    low.link_down(ghost, "late", 1.4)
     assert low.take() == []
     assert low.peers()[0].state == "linked"
 
 
 def test_two_live_instances_with_one_address_are_refused() -> None:
-    low = of(LOW, alive=True)
-    low.link_up(1, HIGH, 0.0, dialled=False)
+    low = of(LOW)
+    low.link_up(with_peer(HIGH, dialled=False), 0.0)
     verdict = low.judge(Hello.of(AGAIN, lease=1.0, expected=None), 1.0)
     assert verdict is not None
     assert verdict.code == Refusal.DUPLICATE
@@ -168,8 +193,8 @@ def test_invented_identities_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPa
     low = of(LOW)
     for i in range(2 * core_limits.PEERS_MAX):
         stranger = Identity(Guid.of("10.1.0.0", i + 1), i.to_bytes(16, "big"), "x")
-        low.link_up(i + 1, stranger, 0.0, dialled=False)
-        low.link_down(i + 1, "lost", 0.0)
+        low.link_up(link := with_peer(stranger, dialled=False), 0.0)
+        low.link_down(link, "lost", 0.0)
     assert len(low.peers()) <= core_limits.PEERS_MAX
 
 
@@ -195,7 +220,6 @@ class Network:
         self.there = {identity.guid: identity for identity in there}
         self.now = 0.0
         self.dialled: list[tuple[float, Guid]] = []
-        self.links = 0
 
     def find(self, *identities: Identity) -> None:
         for identity in identities:
@@ -212,10 +236,7 @@ class Network:
                 if identity is None:
                     self.peering.dial_failed(output[1], "nobody there", self.now)
                 else:
-                    self.links += 1
-                    self.peering.link_up(
-                        self.links, identity, self.now, dialled=True, endpoint=identity.guid.endpoint
-                    )
+                    self.peering.link_up(with_peer(identity), self.now)
 
     def run(self, seconds: float) -> int:
         """Let time pass; return how many dials that were."""
@@ -269,17 +290,6 @@ def test_forged_peers_do_not_starve_a_waiting_one() -> None:
     assert network.linked() == ["high"]
 
 
-def full_mesh(monkeypatch: pytest.MonkeyPatch) -> Peering:
-    """A module of a mesh of four that is full."""
-    monkeypatch.setattr(limits, "MODULES_MAX", 4)
-    peering = of(LOW)
-    for number in range(1, 4):
-        peering.peer_found(stranger(number), 0.0)
-        peering.link_up(number, stranger(number), 0.0, dialled=True, endpoint=stranger(number).guid.endpoint)
-    peering.take()
-    return peering
-
-
 def hello_of(identity: Identity) -> Hello:
     return Hello.of(identity, lease=1.0, expected=LOW.guid)
 
@@ -287,13 +297,18 @@ def hello_of(identity: Identity) -> Hello:
 def test_a_full_mesh_neither_dials_nor_accepts_one_more_until_discovery_has_given_up_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    peering = full_mesh(monkeypatch)
+    monkeypatch.setattr(limits, "MODULES_MAX", 4)
+    peering, links = of(LOW), [with_peer(stranger(number)) for number in range(1, 4)]
+    for link in links:
+        peering.peer_found(link.identity, 0.0)
+        peering.link_up(link, 0.0)
+    peering.take()
     peering.peer_found(stranger(4), 1.0)
     assert dials(peering.take()) == []
     assert peering.judge(hello_of(stranger(4)), 1.0) is FULL
     (status,) = [each for each in peering.peers() if each.identity == stranger(4)]
     assert (status.state, status.last_error) == ("refused", str(FULL))
-    peering.link_down(2, "silent", 2.0, silent=True)
+    peering.link_down(links[1], "silent", 2.0, silent=True)
     assert peering.judge(hello_of(stranger(4)), 3.0) is FULL, "the place is kept for the one that is away"
     assert peering.judge(hello_of(stranger(2)), 3.0) is None
     peering.peer_gone(stranger(2).guid)

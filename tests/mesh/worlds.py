@@ -8,7 +8,7 @@ from typing import Any
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.connection import ConnectionProtocol, DataHandler
-from rmpa.mesh.frames import FrameKind, Hello, Lane, Refuse
+from rmpa.mesh.frames import FrameKind, Hello, Lane, Link, Refuse
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
@@ -16,6 +16,18 @@ HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
 DIALLER, ACCEPTOR = "dialler", "acceptor"
 
 WALL = 1_700_000_000_000_000_000
+
+
+class Known(Link):
+    """A link whose state a test sets."""
+
+    alive, stuck = True, False
+
+
+def with_peer(identity: Identity, *, dialled: bool = True, alive: bool = True) -> Known:
+    link = Known(identity, identity.guid.endpoint, dialled=dialled)
+    link.alive = alive
+    return link
 
 
 class _Route:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.core.identity import Guid, Identity
-from rmpa.discovery.packet_filter import Stranger
+from rmpa.discovery.beacon import Stranger
 from rmpa.observe.snapshot_builder import judge_refusal, judge_stranger, judge_strangers
 from rmpa.trust.permissions import MemberInfo, TrustReason, TrustStatus
 

@@ -20,27 +20,27 @@ from typing import Final
 import pytest
 
 from rmpa.core.log import configure_logging
-from rmpa.runtime import limits, realtime
-from rmpa.runtime.files import set_aside
-from rmpa.runtime.log_writer import LogWriter
-from rmpa.runtime.systemd import restart_text, watchdog_period
+from rmpa.runtime import limits, loop
+from rmpa.runtime.loop import make_realtime
+from rmpa.runtime.programs import set_aside
+from rmpa.runtime.systemd import LogWriter, restart_text, watchdog_period
 
 NOBODY: Final = 65534
 
 CHILD: Final = """
 import json, os, resource, sys, threading
-from rmpa.runtime import realtime
+from rmpa.runtime.loop import make_realtime, worker_pool
 
 def who(tid=0):
     return os.sched_getscheduler(tid) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(tid).sched_priority
 
-outcomes = realtime.apply(**json.loads(sys.argv[1]))
+outcomes = make_realtime(**json.loads(sys.argv[1]))
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 others = []
 thread = threading.Thread(target=lambda: others.append(who()))
 thread.start()
 thread.join()
-with realtime.worker_pool() as pool:
+with worker_pool() as pool:
     worker = pool.submit(who).result()
 child = os.fork()
 if child == 0:
@@ -164,10 +164,10 @@ def test_an_unprivileged_process_runs_on() -> None:
 def test_a_refusal_is_logged_with_what_grants_it(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(realtime, "_schedule", lambda _: "Operation not permitted")
-    monkeypatch.setattr(realtime, "_lock_memory", lambda: "")
+    monkeypatch.setattr(loop, "_schedule", lambda _: "Operation not permitted")
+    monkeypatch.setattr(loop, "_lock_memory", lambda: "")
     with caplog.at_level(logging.INFO):
-        realtime.apply(50, lock_memory=True)
+        make_realtime(50, lock_memory=True)
     lines = [(record.levelname, record.getMessage()) for record in caplog.records]
     refusal = (
         "! realtime: no SCHED_FIFO, priority 50: Operation not permitted; to get it: systemd: sudo rmpa service "

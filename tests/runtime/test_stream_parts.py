@@ -69,14 +69,10 @@ class Sender:
 
     def __init__(self, sock: socket.socket, outbox: Outbox | None = None) -> None:
         self.ends: list[Exception | None] = []
-        box = large_outbox() if outbox is None else outbox
-        self.stream = Stream(
-            sock,
-            on_bytes=lambda view: (len(view), 0),
-            on_close=self.ends.append,
-            outbox=box,
-            frame=pack_fragment_header,
-        )
+        own = Outbox(1, 1) if outbox is None else outbox
+        self.stream = Stream(sock, on_bytes=lambda view: (len(view), 0), on_close=self.ends.append, outbox=own)
+        if outbox is None:
+            self.stream.adopt(large_outbox(), pack_fragment_header)
         STREAMS.append(self.stream)
         self.number = 0
         self.sent: list[tuple[int, int]] = []
@@ -517,7 +513,7 @@ async def test_whole_entries_are_sent_by_the_next_connection(sockets: Sockets) -
 
 
 async def test_an_outbox_of_its_own_ends_with_the_stream(sockets: Sockets) -> None:
-    sender = Sender(sockets[0])
+    sender = Sender(sockets[0], large_outbox())
     stuff(sockets[0])
     for _ in range(3):
         sender.send(1, 5000)

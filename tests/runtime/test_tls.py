@@ -243,10 +243,10 @@ async def test_ciphertext_never_comes_into_a_kept_outbox(tls: SecurePairs) -> No
         tls.sockets[0],
         on_bytes=lambda view: (len(view), 0),
         on_close=lambda _: None,
-        outbox=outbox,
-        keep=True,
+        outbox=Outbox(1, 1),
         secure=one,
     )
+    stream.adopt(outbox, None)
     message = b"plain text " * 1000
     while not outbox.waiting_entries or outbox.waiting_entries < 5:
         stream.send((message,), 1)

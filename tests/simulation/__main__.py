@@ -6,8 +6,7 @@ import argparse
 import sys
 
 from tests.simulation.direct_scenario import DirectScenario
-from tests.simulation.mesh_scenario import MeshScenario
-from tests.simulation.rests_scenario import RestsScenario
+from tests.simulation.mesh_scenario import MeshScenario, RestsScenario
 from tests.simulation.scenario import Scenario
 
 

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 from rmpa.config.settings import LaneSettings
 from rmpa.core.statistics import Counters
-from rmpa.mesh.io.dial import Dialler
+from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.runtime.loop import SystemClock
 from tests.simulation.process import Process
 from tests.simulation.roster_peer import RosterPeer
 from tests.simulation.sockets import SimListener, SimSocket, connect
@@ -23,22 +22,7 @@ if TYPE_CHECKING:
     from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.frames import Lane
     from rmpa.mesh.io.link import PeerLink
-    from tests.simulation.network import Address, World
-
-
-class SimClock(SystemClock):
-    """The world's time as the mesh asks for it."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-
-    def now(self) -> float:
-        """Monotonic seconds."""
-        return self._world.now
-
-    def wall_ns(self) -> int:
-        """The wall clock."""
-        return round(self._world.now * 1e9)
+    from tests.simulation.network import Address
 
 
 class SimDialler(Dialler):
@@ -79,7 +63,6 @@ class MeshPeer(RosterPeer):
                 ours(self.link_down),
                 *[lambda *_: None] * 4,  # nothing but links is looked at
             ),
-            clock=SimClock(self.world),
             rng=rng.random,
             dialler=SimDialler(self),
         )
@@ -131,14 +114,14 @@ class MeshPeer(RosterPeer):
 
     def link_up(self, link: PeerLink) -> None:
         """A peer is linked."""
-        self.note(f"= link {link.id} up {link.identity}")
+        self.note(f"= link up {link.identity}")
         link.bulk._on_wanted()
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 
     def link_down(self, link: PeerLink, reason: str) -> None:
         """Its link is not used any more."""
-        self.note(f"= link {link.id} down {link.identity}: {reason}")
+        self.note(f"= link down {link.identity}: {reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)
         self.flush()
 

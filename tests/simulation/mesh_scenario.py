@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from types import SimpleNamespace
 from unittest import mock
 
 from rmpa.mesh import limits
@@ -50,7 +52,9 @@ class MeshScenario(Scenario):
     def simulated(self) -> Iterator[None]:
         """Replace what the code would ask of the operating system."""
         slower = _SLOWER if self.count > _MANY else 1
+        clocks = SimpleNamespace(monotonic=lambda: self.world.now, time_ns=self.world.time_ns)
         with (
+            mock.patch("rmpa.runtime.loop.time", clocks),
             mock.patch("rmpa.runtime.stream.Stream.unacknowledged", property(lambda stream: stream._sock.in_flight)),
             mock.patch("rmpa.runtime.accept.Descriptors.has_room", return_value=True),
             mock.patch.multiple(
@@ -99,7 +103,9 @@ class MeshScenario(Scenario):
             self._check_connections(peer, others)
             for other in (living[instance] for instance in others):
                 self._check_pair(peer, other)
-            assert all(view.run.linked for view in peer.roster.peers()), f"{peer.name} does not know its links"
+            assert all(view.run.linked for view in peer.roster.endpoints.views()), (
+                f"{peer.name} does not know its links"
+            )
 
     def _check_connections(self, peer: MeshPeer, others: list[bytes]) -> None:
         for bulk in (False, True):
@@ -129,3 +135,45 @@ class MeshScenario(Scenario):
 
     def _names(self, instances: list[bytes]) -> list[str]:
         return [peer.name for peer in self.peers for i in instances if peer.identity.instance == i]
+
+
+class RestsScenario(MeshScenario):
+    """Links that rest and wake at random; at last one is needed whose peer is gone."""
+
+    kind = "rests"
+    healed = checked = False
+
+    def prepare(self) -> None:
+        """Each agent changes its mind every second or so."""
+        super().prepare()
+        for peer in self.peers:
+            self.world.after(self.world.rng.random(), partial(self._change, peer))
+
+    def heal(self) -> None:
+        """Heal; from now on nothing needs the links."""
+        super().heal()
+        self.healed = True
+
+    def check(self) -> None:
+        """Check links and rosters; all links rest, and a cut shows within seconds to the side that needs one."""
+        super().check()
+        self.checked = True
+        living = [peer for peer in self.peers if peer.alive]
+        for peer in living:
+            assert all(link.rests for link in peer.mesh.links()), f"{peer.name} has a link that does not rest"
+        if len(living) < 2:
+            return
+        peer = living[0]
+        links = peer.mesh.links()
+        self.network.sides = {each.host: int(each is peer) for each in self.peers}
+        for link in links:
+            peer.process.run(partial(link.need, needed=True))
+        self.world.run(self.world.now + limits.WAKE_TIMEOUT + limits.EXPRESS_LEASE)
+        assert not any(link.connection.up for link in links), f"{peer.name} has not noticed that its peers are gone"
+
+    def _change(self, peer: MeshPeer) -> None:
+        if peer.alive and not self.checked:
+            for link in peer.mesh.links():
+                needed = not self.healed and self.world.rng.random() < 0.4
+                peer.process.run(partial(link.need, needed=needed))
+        self.world.after(1.0, partial(self._change, peer))

@@ -74,11 +74,11 @@ class RosterPeer:
 
     def view(self) -> tuple[Identity, ...]:
         """The identities in the roster."""
-        return tuple(v.run.identity for v in self.roster.peers() if v.present)
+        return tuple(v.run.identity for v in self.roster.endpoints.views() if v.present)
 
     def troubles(self) -> list[str]:
         """Conflicts that the roster reports."""
-        return [text for v in self.roster.peers() for text in v.conflicts]
+        return [text for v in self.roster.endpoints.views() for text in v.conflicts]
 
     def on_event(self, event: PeerEvent) -> None:
         """Write an event of the roster into the trace."""

@@ -13,7 +13,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.limits import KIB
-from rmpa.mesh.io.dial import LINK_UNACKED
+from rmpa.mesh.io.lane import LINK_UNACKED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -10,9 +10,8 @@ import pytest
 
 from rmpa.mesh import limits
 from tests.simulation.mesh_peer import MeshPeer
-from tests.simulation.mesh_scenario import MeshScenario
+from tests.simulation.mesh_scenario import MeshScenario, RestsScenario
 from tests.simulation.network import Weather
-from tests.simulation.rests_scenario import RestsScenario
 from tests.simulation.scenario import FACTOR
 
 pytestmark = pytest.mark.timeout(300)  # seconds of computing, beside parts of the suite that compute too

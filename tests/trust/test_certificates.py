@@ -16,12 +16,13 @@ from rmpa.trust import limits
 from rmpa.trust.certificates import (
     URN,
     DenyList,
+    ModuleCertificate,
     ca_public_key,
     check_ca,
     issue,
     make_request,
+    read_certificate,
     read_request,
-    verify,
 )
 from rmpa.trust.permissions import TrustError, TrustReason, host_names, page_hosts, server_names
 from rmpa.trust.tokens import fingerprint_of
@@ -37,15 +38,30 @@ ARM = LAB.module("arm", key=ARM_KEY)
 DAY = 86_400.0
 
 
-def _refused(data: bytes, wall: float = WALL, *, ca: bytes = LAB.certificate, **kwargs: object) -> TrustReason:
+def verify(
+    data: bytes,
+    wall: float = WALL,
+    *,
+    ca: bytes = LAB.certificate,
+    name: str = "",
+    deny: DenyList | None = None,
+    grace: float = 0.0,
+) -> ModuleCertificate:
+    """Read and judge."""
+    found = read_certificate(data, ca)
+    found.judge(wall, name, deny, grace)
+    return found
+
+
+def _refused(data: bytes, wall: float = WALL, **kwargs: object) -> TrustReason:
     with pytest.raises(TrustError) as caught:
-        verify(data, ca, wall, **kwargs)  # type: ignore[arg-type] # the test's own words
+        verify(data, wall, **kwargs)  # type: ignore[arg-type] # the test's own words
     assert str(caught.value)
     return caught.value.reason
 
 
 def test_what_is_issued_is_verified() -> None:
-    found = verify(ARM, LAB.certificate, WALL, name="arm", deny=DenyList())
+    found = verify(ARM, name="arm", deny=DenyList())
     assert found.name == "arm"
     assert found.issued == WALL
     assert found.expires == WALL + limits.CERTIFICATE_LIFETIME
@@ -94,14 +110,14 @@ def test_each_other_certificate_has_its_reason() -> None:
 def test_a_revoked_name_can_be_invited_again() -> None:
     deny = DenyList().with_name("arm", WALL)
     again = LAB.module("arm", WALL + 1)
-    assert verify(again, LAB.certificate, WALL + 1, deny=deny).name == "arm"
-    assert verify(LAB.module("base"), LAB.certificate, WALL, deny=deny).name == "base"
+    assert verify(again, WALL + 1, deny=deny).name == "arm"
+    assert verify(LAB.module("base"), deny=deny).name == "base"
 
 
 def test_grace_is_for_renewal_alone() -> None:
     late = WALL + limits.CERTIFICATE_LIFETIME + 30 * DAY
     assert _refused(ARM, late) is TrustReason.EXPIRED
-    assert verify(ARM, LAB.certificate, late, grace=limits.RENEWAL_GRACE).name == "arm"
+    assert verify(ARM, late, grace=limits.RENEWAL_GRACE).name == "arm"
     assert _refused(ARM, WALL + 400 * DAY, grace=limits.RENEWAL_GRACE) is TrustReason.EXPIRED
     deny = DenyList().with_name("arm", WALL)
     assert _refused(ARM, late, grace=limits.RENEWAL_GRACE, deny=deny) is TrustReason.REVOKED
@@ -110,7 +126,7 @@ def test_grace_is_for_renewal_alone() -> None:
 def _outcome(data: bytes) -> object:
     """What a certificate says, or why it is refused."""
     try:
-        return verify(data, LAB.certificate, WALL)
+        return verify(data)
     except TrustError as error:
         return error.reason
 
@@ -138,7 +154,7 @@ def test_a_request_proves_its_key() -> None:
     request = make_request(ARM_KEY, "arm")
     found = read_request(request)
     assert found.name == "arm"
-    assert found.public_key == verify(ARM, LAB.certificate, WALL).public_key
+    assert found.public_key == verify(ARM).public_key
     assert len(found.key_hash) == 32
     accepted = 0
     for offset in range(len(request)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import dataclasses
 import hashlib
 from ipaddress import IPv4Address
 
@@ -13,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.trust import limits
 from rmpa.trust.tokens import (
     PREFIX,
     CertificateGrant,
@@ -23,7 +21,6 @@ from rmpa.trust.tokens import (
     JoinRefused,
     Renew,
     Token,
-    TokenBook,
     TokenError,
     decode_message,
     encode_message,
@@ -134,60 +131,20 @@ def test_a_fingerprint_is_half_a_hash() -> None:
     assert fingerprint_of(b"der") == hashlib.sha256(b"der").digest()[:16]
 
 
-def test_a_token_lets_one_module_join_once() -> None:
-    book = TokenBook()
-    book.invite(TOKEN)
-    assert [i.key for i in book.invitations] == [TOKEN.key]
-    assert book.judge(TOKEN.token_id, "arm", WALL) == ""
-    assert book.use(TOKEN.token_id, "arm", WALL) == ""
-    assert book.use(TOKEN.token_id, "arm", WALL) == "used"
-    assert [(i.used_by, i.key) for i in book.invitations] == [("arm", b"")]
-    assert TokenBook(book.invitations).use(TOKEN.token_id, "arm", WALL) == "used", "also after a restart"
-
-
-def test_unknown_late_and_other_names_are_told_apart() -> None:
-    book = TokenBook()
-    with pytest.raises(ValueError, match="not a ROS base name"):
-        book.invite(TOKEN, "my arm")
-    book.invite(TOKEN, "arm")
-    assert book.use(bytes(8), "arm", WALL) == "token"
-    assert book.use(TOKEN.token_id, "base", WALL) == "name"
-    assert book.use(TOKEN.token_id, "arm", TOKEN.expires) == "late"
-    assert book.use(TOKEN.token_id, "arm", WALL) == ""
-
-
-def test_a_token_can_be_withdrawn() -> None:
-    book = TokenBook()
-    book.invite(TOKEN)
-    assert book.withdraw(TOKEN.token_id)
-    assert not book.withdraw(TOKEN.token_id)
-    assert book.use(TOKEN.token_id, "arm", WALL) == "token"
-
-
-def test_a_new_token_for_a_name_replaces_the_open_one() -> None:
-    other, third = (dataclasses.replace(TOKEN, secret=bytes([n]) * 16) for n in (8, 9))
-    book = TokenBook()
-    for token in (TOKEN, other):
-        book.invite(token, "arm")
-    book.invite(third)
-    assert [book.judge(token.token_id, "arm", WALL) for token in (TOKEN, other, third)] == ["token", "", ""]
-
-
-def test_tokens_are_bounded_and_used_ones_go_first() -> None:
-    book = TokenBook()
-    tokens = [
-        Token(1000 + n, IPv4Address("10.0.0.1"), 1, bytes(16), n.to_bytes(16, "big"))
-        for n in range(limits.TOKENS_MAX + 2)
-    ]
-    for token in tokens[: limits.TOKENS_MAX]:
-        book.invite(token)
-    book.use(tokens[7].token_id, "arm", 0.0)
-    book.invite(tokens[-2])
-    book.invite(tokens[-1])
-    assert len(book.invitations) == limits.TOKENS_MAX
-    assert book.judge(tokens[7].token_id, "arm", 0.0) == "token"
-    assert book.judge(tokens[0].token_id, "arm", 0.0) == "token"
-    assert book.judge(tokens[1].token_id, "arm", 0.0) == ""
+@pytest.mark.parametrize(
+    ("named", "used_by", "name", "wall", "problem"),
+    [
+        ("", "", "arm", WALL, ""),
+        ("arm", "", "arm", WALL, ""),
+        ("", "arm", "arm", WALL, "used"),
+        ("arm", "", "base", WALL, "name"),
+        ("", "", "arm", TOKEN.expires, "late"),
+    ],
+)
+def test_what_is_wrong_with_a_token_is_told_apart(
+    named: str, used_by: str, name: str, wall: float, problem: str
+) -> None:
+    assert Invitation(TOKEN.token_id, TOKEN.key, TOKEN.expires, named, used_by).problem(name, wall) == problem
 
 
 @given(

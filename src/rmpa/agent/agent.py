@@ -36,6 +36,7 @@ from rmpa.discovery.discovery import Discovery
 from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
+from rmpa.mesh.keepalive import rest_lease
 from rmpa.mesh.peering import REPLACED
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
 from rmpa.observe.control_server import ControlServer, control_group
@@ -53,10 +54,9 @@ from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.http.server import listen
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.loggers import serve_loggers
-from rmpa.runtime import realtime
 from rmpa.runtime.accept import Use, open_mesh_port
 from rmpa.runtime.kernel_tcp import may_end_connections
-from rmpa.runtime.loop import SystemClock
+from rmpa.runtime.loop import SystemClock, freeze_heap, thaw_heap
 from rmpa.runtime.systemd import unit_of
 from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import Permissions
@@ -109,7 +109,6 @@ class NetworkEndpoint:
             further_addresses(usable, address),
         )
         bridge.place(self.identity)
-        self._members: set[Guid] = set()
         self.mesh = Mesh(
             self.identity,
             tcp,
@@ -122,7 +121,6 @@ class NetworkEndpoint:
                 bridge.sessions.lane_lost,
             ),
             lanes=settings.lanes,
-            clock=clock,
             security=trust.membership if trust is not None else None,
             on_join=trust.joins.serve if trust is not None and trust.joins is not None else None,
         )
@@ -153,13 +151,11 @@ class NetworkEndpoint:
         match event.change:
             case "found":
                 _log.info("+ %s found", identity)
-                self._members.add(identity.guid)
                 self.mesh.peer_found(identity, event.source[0] if event.source else None)
             case "changed":
                 self.mesh.peer_found(identity)
             case "lost":
                 _log.info("- %s %s", identity, event.reason)
-                self._members.discard(identity.guid)
                 self.mesh.peer_gone(identity.guid)
             case "doubted":
                 # A link at rest would notice after many seconds that its peer is gone.
@@ -167,7 +163,7 @@ class NetworkEndpoint:
                     link.touch()
             case "conflict":
                 pass  # discovery has logged the error, at a bounded rate
-        self.mesh.count_peers(len(self._members))
+        self.mesh.pace.rest_lease = rest_lease(self.discovery.membership.size)
 
     def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
@@ -497,8 +493,8 @@ class Agent:
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self.control.start()
-            realtime.freeze_heap()
-            undo.callback(realtime.thaw_heap)
+            freeze_heap()
+            undo.callback(thaw_heap)
             self._undo = undo.pop_all()
         _log.info("= ROS_MASTER_URI=%s", shown_uri(self.core.uri))
         self.network.warn_if_open()

@@ -22,11 +22,10 @@ from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.timers import Backoff
 from rmpa.observe.control_client import ReloadReply, runtime_dir
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime import realtime
 from rmpa.runtime.accept import is_shortage, open_files_advice, raise_file_limit
 from rmpa.runtime.interpreter import own_command
 from rmpa.runtime.kept_program import KeptProgram, ProgramNote
-from rmpa.runtime.loop import AgentLoop
+from rmpa.runtime.loop import AgentLoop, make_realtime, worker_pool
 from rmpa.runtime.programs import end_program, keep_capabilities, start_program
 from rmpa.runtime.systemd import SERVICE_VARIABLES, feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
@@ -264,7 +263,7 @@ async def serve(
     """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    loop.set_default_executor(realtime.worker_pool())
+    loop.set_default_executor(worker_pool())
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     came, had_terminal = asyncio.Event(), has_terminal()
@@ -306,7 +305,7 @@ def run_process(
     keep_capabilities()
     sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
     wanted = settings.realtime
-    outcomes = realtime.apply(wanted.priority, lock_memory=wanted.lock_memory) if wanted.enabled else ()
+    outcomes = make_realtime(wanted.priority, lock_memory=wanted.lock_memory) if wanted.enabled else ()
     try:
         with asyncio.Runner(loop_factory=AgentLoop) as runner:
             runner.run(main(outcomes))

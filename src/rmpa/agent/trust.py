@@ -39,7 +39,6 @@ from rmpa.trust import limits
 from rmpa.trust.permissions import (
     HAVE,
     Document,
-    DocumentSpreading,
     Have,
     InviteReply,
     JoinStep,
@@ -51,7 +50,7 @@ from rmpa.trust.permissions import (
 from rmpa.trust.store import AuthorityPlace, TrustStore, check_open
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.sessions import PeerSession
@@ -99,7 +98,7 @@ def open_membership(settings: Settings, clock: SystemClock) -> Membership | None
     except ModuleNotFoundError as error:
         missing = f"the library {error.name} is not installed, but this module has joined a secured mesh"
         raise StartError(str(store.folder), missing, missing_extra("trust"), code="extra-missing") from None
-    membership = Membership.load(store, clock, time.time)
+    membership = Membership.load(store, clock)
     if membership.name != settings.name:
         text = f"is of {membership.name}, but this agent is named {settings.name}"
         remedy = f"start it with --name {membership.name}, or let it join: rmpa trust leave, rmpa trust join TOKEN"
@@ -136,13 +135,14 @@ class AgentTrust(Part):
         self._clock = clock
         self._refusals = RefusalLog(_log, bridge.counters)
         self._hosts_asked: tuple[str, ...] = ()
-        self._spreading = DocumentSpreading(membership.number)
+        # The numbers of the documents that each linked peer has, as far as it has said; what was sent counts.
+        self._had: dict[int, dict[Document, int]] = {}
         self._authority_peer: PeerSession | None = None
         self.authority: MeshAuthority | None = None
         self.joins: JoinServer | None = None
         if membership.store.is_authority:
-            self.authority = MeshAuthority(membership)
-            self.joins = JoinServer(self.authority, clock, self.is_linked, bridge.counters)
+            self.authority = MeshAuthority(membership, self._is_linked)
+            self.joins = JoinServer(self.authority, clock, bridge.counters)
         self._backoff = Backoff(limits.RENEWAL_RETRY_FIRST, limits.RENEWAL_RETRY_CAP, random.random)
         self._retry_at = 0.0
         self._renewals: dict[str, TokenBucket] = {}
@@ -185,14 +185,14 @@ class AgentTrust(Part):
 
     def link_up(self, session: PeerSession) -> None:
         """Tell a new link what this module has."""
-        self._spreading.link_up(session.peer)
+        self._had[session.peer] = {}
         member = self.membership
         have = Have(member.deny.number, member.keys.number, self.authority is not None)
         self._bridge.rpc.notify(session, HAVE, msgspec.to_builtins(have))
 
     def link_down(self, session: PeerSession) -> None:
         """Forget what the peer has."""
-        self._spreading.link_down(session.peer)
+        self._had.pop(session.peer, None)
         if not session.linked:
             self.gone(session)
 
@@ -208,7 +208,7 @@ class AgentTrust(Part):
                 self._authority_found(session)
             else:
                 self._refuse("trust.no_authority", name, f"{name} says that it is the authority, which it is not")
-        self._spreading.has(session.peer, have.numbers)
+        self._note(session, have.numbers)
         self.spread()
 
     def _document(self, kind: Document, session: PeerSession, args: dict[str, Any]) -> None:
@@ -220,20 +220,33 @@ class AgentTrust(Part):
             return
         if newer:
             number = self.membership.number(kind)
-            self._spreading.has(session.peer, {kind: number})
+            self._note(session, {kind: number})
             _log.info("= %s %d by %s", kind, number, name)
             self.spread()
 
     def _refuse(self, counter: str, name: str, text: str) -> None:
         self._refusals.refuse(self._clock.now(), counter, name, text)
 
+    def _note(self, session: PeerSession, numbers: Mapping[Document, int]) -> None:
+        """Take in that a peer has these documents, as it says or as it sent them."""
+        had = self._had.get(session.peer, {})
+        had.update({kind: max(number, had.get(kind, 0)) for kind, number in numbers.items()})
+
     def spread(self) -> None:
-        """Send newer documents to all that lack them."""
-        sessions = {session.peer: session for session in self._bridge.sessions.linked()}
-        for peer, kind in self._spreading.lacking():
-            if peer in sessions:
-                document = self.membership.document(kind).decode()
-                self._bridge.rpc.notify(sessions[peer], kind.notice, {"document": document})
+        """Send newer documents to all that lack them.
+
+        Each module tells a new link the numbers of its documents; the side with a higher number sends that document.
+        A module that takes a newer one sends it on. So a document is everywhere after as many trips as the mesh is
+        wide, and in a mesh that was split once it is whole again.
+        """
+        for session in self._bridge.sessions.linked():
+            had = self._had.get(session.peer, {})
+            for kind in Document:
+                number = self.membership.number(kind)
+                if had.get(kind, number) < number:
+                    had[kind] = number
+                    document = self.membership.document(kind).decode()
+                    self._bridge.rpc.notify(session, kind.notice, {"document": document})
 
     def _authority_found(self, session: PeerSession) -> None:
         self._authority_peer = session
@@ -349,7 +362,7 @@ class AgentTrust(Part):
             return self.membership.name
         return self._authority_peer.link.name if self._authority_peer is not None else ""
 
-    def is_linked(self, name: str) -> bool:
+    def _is_linked(self, name: str) -> bool:
         """Whether a module of a name is linked, or is this one; upper and lower case are the same."""
         return name.casefold() in {each.casefold() for each in (self.membership.name, *self.linked())}
 
@@ -473,7 +486,7 @@ class TrustCommands:
         except ValueError:
             raise ConfigError("request", "is not in base64") from None
         again = str(args.get("module") or "")
-        asked, answer = self._authority().join_file(request, again, self._trust.is_linked)
+        asked, answer = self._authority().join_file(request, again)
         return {
             "module": asked.name,
             "key": asked.key_hash[: limits.FINGERPRINT_BYTES].hex(),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import RmpaError
-from rmpa.runtime.files import replace_file
+from rmpa.runtime.programs import replace_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -31,7 +31,7 @@ from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.control_client import ControlClient, ReloadReply, find_agents, runtime_dir, same_core
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.environment import DEFAULT_MASTER_URI, shown_uri
-from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.systemd import LogWriter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

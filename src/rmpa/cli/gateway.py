@@ -22,7 +22,7 @@ from rmpa.config.settings import WebSettings
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
-from rmpa.runtime.log_writer import LogWriter
+from rmpa.runtime.systemd import LogWriter
 from rmpa.trust.permissions import TrustStatus
 
 if TYPE_CHECKING:

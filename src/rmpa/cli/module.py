@@ -6,7 +6,6 @@ import functools
 import importlib.util
 import os
 import socket
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -124,7 +123,7 @@ class Module:
         from rmpa.runtime.loop import SystemClock
         from rmpa.trust.membership import Membership
 
-        return Membership.load(self.store, SystemClock(), time.time)
+        return Membership.load(self.store, SystemClock())
 
     def authority(self) -> MeshAuthority:
         """What the files say, without the agent, of the authority.

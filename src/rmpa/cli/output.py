@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings
     from rmpa.ros.types.messages import Plain
-    from rmpa.runtime.log_writer import LogWriter
+    from rmpa.runtime.systemd import LogWriter
 
 _INDENT: Final = "    "
 # Of the levels of ``rmpa doctor`` and ``rmpa why``, on a terminal; of all others yellow.

@@ -493,9 +493,9 @@ def trust_join(
     module.store.save(files)
     module.store.forget("request.key")
     start = keep_member_name(module)
-    from rmpa.trust import certificates
+    from rmpa.trust.certificates import read_certificate
 
-    found = certificates.verify(files.certificate, files.ca, None)
+    found = read_certificate(files.certificate, files.ca)
     done = f"{found.name} has joined; its certificate ends {date_of(found.expires)}, and renews itself before"
     options.show(TrustReply(module=found.name, done=True, expires=int(found.expires)), done)
     if options.as_json:

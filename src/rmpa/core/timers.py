@@ -1,4 +1,4 @@
-"""Time in protocol machines: many timers in a heap, periods, back-off, token buckets, and yielding to pending data.
+"""Time in protocol machines: many timers in a heap, periods, back-off, rates, and yielding to pending data.
 
 Machines get ``now`` and never read a clock: seconds (float) of a monotonic clock with an arbitrary zero. Stamps on
 the wire are nanoseconds (int) of the sender's wall clock.
@@ -7,11 +7,12 @@ the wire are nanoseconds (int) of the sender's wall clock.
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from heapq import heapify, heappop, heappush
 from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Hashable, Iterable
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")
@@ -152,6 +153,33 @@ class TokenBucket:
         if now > self._at:
             self._level = min(self._burst, self._level + (now - self._at) * self._rate)
             self._at = now
+
+
+class AddressLimit:
+    """Allows each address so many packets in a while, and forgets the address that was silent for longest.
+
+    Args:
+        count: Packets of one address.
+        addresses: How many are remembered.
+        interval: The while, in seconds.
+    """
+
+    def __init__(self, count: int, addresses: int, interval: float = 1.0) -> None:
+        self._most = count
+        self._addresses = addresses
+        self._interval = interval
+        self._counts: OrderedDict[Hashable, tuple[float, int]] = OrderedDict()
+
+    def take(self, address: Hashable, now: float) -> bool:
+        """Count a packet; return whether it is allowed."""
+        since, count = self._counts.get(address, (now, 0))
+        if now - since >= self._interval:
+            since, count = now, 0
+        self._counts[address] = (since, count + 1)
+        self._counts.move_to_end(address)
+        if len(self._counts) > self._addresses:
+            self._counts.popitem(last=False)
+        return count < self._most
 
 
 class Yielder(Protocol):

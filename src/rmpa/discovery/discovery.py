@@ -7,6 +7,7 @@ import contextlib
 import logging
 import random
 import time
+from dataclasses import dataclass
 from functools import partial
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING, Final
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.discovery import limits, network
+from rmpa.discovery.beacon import PacketFilter, Stranger
 from rmpa.discovery.membership import MembershipProtocol
-from rmpa.discovery.packet_filter import PacketFilter, Stranger
 from rmpa.runtime.loop import MachineTimer, call_at_tick, yield_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task
 
@@ -25,9 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Guid, Identity
-    from rmpa.core.timers import Yielder
     from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.endpoints import PeerView
     from rmpa.discovery.membership import PeerEvent
     from rmpa.discovery.network import Interface
     from rmpa.trust.packets import PacketTrust
@@ -43,6 +42,7 @@ _ALL_NETWORKS: Final = ""
 _ALONE: Final = "no interface that can carry multicast is up: other machines are only found by --seed"
 
 
+@dataclass(eq=False)
 class Discovery:
     """Finds the other agents of the domain, and makes this one known to them.
 
@@ -61,40 +61,30 @@ class Discovery:
 
     Attributes:
         interfaces: The interfaces in use.
+        membership: Which peers are there.
     """
 
-    def __init__(
-        self,
-        identity: Identity,
-        settings: Settings,
-        udp_socket: socket.socket,
-        *,
-        on_event: Callable[[PeerEvent], None],
-        on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
-        look: Callable[[], tuple[Interface, ...]] = network.list_interfaces,
-        resolve: Callable[[str], list[str]] = network.resolve_ipv4,
-        trust: PacketTrust | None = None,
-    ) -> None:
-        self._trust = trust
+    identity: Identity
+    settings: Settings
+    udp_socket: socket.socket
+    on_event: Callable[[PeerEvent], None]
+    on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True
+    look: Callable[[], tuple[Interface, ...]] = network.list_interfaces
+    resolve: Callable[[str], list[str]] = network.resolve_ipv4
+    trust: PacketTrust | None = None
+
+    def __post_init__(self) -> None:
+        settings = self.settings
         self.counters = Counters()
         self.interfaces: tuple[Interface, ...] = ()
-        self._identity = identity
-        self._settings = settings
-        self._udp = udp_socket
-        network.enlarge_buffer(udp_socket)
-        self._on_event = on_event
-        self._on_interfaces = on_interfaces
-        self._look = look
-        self._resolve = resolve
-        self._membership = MembershipProtocol(
-            identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
+        network.enlarge_buffer(self.udp_socket)
+        self.membership = MembershipProtocol(
+            self.identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
         )
-        self._filter = PacketFilter(
-            settings.domain, self.counters, is_verified=self._membership.is_verified, trust=trust
-        )
+        self._filter = PacketFilter(settings.domain, self.counters, self.membership.is_verified, self.trust)
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.multicast.group, settings.discovery_port)
-        self._sender = network.Sender(udp_socket, self._group, self.counters)
+        self._sender = network.Sender(self.udp_socket, self._group, self.counters)
         self._everything: tuple[Interface, ...] = ()
         self._seed_hosts: dict[str, list[str]] = {}
         self._tasks: list[asyncio.Task[None]] = []
@@ -104,30 +94,30 @@ class Discovery:
         self._heartbeats: socket.socket | None = None
         self._heartbeats_tick: asyncio.TimerHandle | None = None
         self._warned: set[str] = set()
-        self._timer = MachineTimer(self._membership.next_timer, self._timer_due)
+        self._timer = MachineTimer(self.membership.next_timer, self._timer_due)
         self._started = False
         self._flushing = False
 
     async def start(self) -> None:
         """Listen, and announce this agent. A socket that cannot be opened is logged; discovery works without it."""
         self._started = True
-        self._listen(self._udp, multicast=False)
+        self._listen(self.udp_socket, multicast=False)
         # Unicasts to the discovery port, the port of seeds without one; one agent of a machine gets them.
         self._open_receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
-        if self._settings.multicast.enabled:
+        if self.settings.multicast.enabled:
             self._open_group()
-        self._everything = self._look()
+        self._everything = self.look()
         self._use_interfaces()
         now = time.monotonic()
-        self._membership.interfaces_changed(now, self._other_addresses())
-        self._membership.start(now)
+        self.membership.interfaces_changed(now, self._other_addresses())
+        self.membership.start(now)
         self._flush()
         self._tasks = [keep_task(partial(network.watch_interfaces, self._look_again), "watch the interfaces")]
-        for host in dict.fromkeys(seed.host for seed in self._settings.seeds):
+        for host in dict.fromkeys(seed.host for seed in self.settings.seeds):
             try:
                 self._seed_hosts[host] = [str(IPv4Address(host))]
             except AddressValueError:
-                follow = partial(network.follow_seed, host, self._resolve, self._seed_is)
+                follow = partial(network.follow_seed, host, self.resolve, self._seed_is)
                 self._tasks.append(keep_task(follow, f"follow seed {host}"))
         self._set_seeds()
 
@@ -138,10 +128,10 @@ class Discovery:
         self._started = False
         await end_tasks(*self._tasks)
         self._timer.close()
-        self._membership.goodbye(time.monotonic())
+        self.membership.goodbye(time.monotonic())
         self._flush()
         loop = asyncio.get_running_loop()
-        loop.remove_reader(self._udp.fileno())
+        loop.remove_reader(self.udp_socket.fileno())
         for sock in self._receivers:
             loop.remove_reader(sock.fileno())
             sock.close()
@@ -158,17 +148,13 @@ class Discovery:
             endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
                 (not the port of a connection that it dialled).
         """
-        self._membership.link_up(identity, time.monotonic(), endpoint)
+        self.membership.link_up(identity, time.monotonic(), endpoint)
         self._flush()
 
     def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
         """The link to this peer (to this run of it, if ``instance`` is given) fell."""
-        self._membership.link_down(guid, time.monotonic(), instance)
+        self.membership.link_down(guid, time.monotonic(), instance)
         self._flush()
-
-    def peers(self, yielder: Yielder = iter) -> list[PeerView]:
-        """All known peers, in GUID order."""
-        return self._membership.peers(yielder)
 
     def strangers(self) -> tuple[Stranger, ...]:
         """The modules that are heard and are not of this mesh."""
@@ -178,9 +164,9 @@ class Discovery:
         """Problems of the network, as texts for the user."""
         strangers = {host for one in self.strangers() for host, _ in one.identity.endpoints}
         silent = [
-            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
+            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self.settings.domain} too, "
             "and its UDP port open?"
-            for host, port in self._membership.silent_seeds()
+            for host, port in self.membership.silent_seeds()
             if host not in strangers
         ]
         full = self._filter.strangers_note(time.monotonic())
@@ -218,7 +204,7 @@ class Discovery:
             more = self._take(self._heartbeats, multicast=True)  # first, as they were sent before what is read now
         if sock is not self._heartbeats:
             self._take(sock, multicast=multicast)
-        elif not more and self._membership.size >= limits.HEARTBEATS_WAIT_MEMBERS:
+        elif not more and self.membership.size >= limits.HEARTBEATS_WAIT_MEMBERS:
             self._defer_heartbeats(sock)
         elif self._heartbeats_tick is not None:
             self._heartbeats_tick = None
@@ -226,7 +212,7 @@ class Discovery:
         if self._filter.overrun:
             # A flood of forged packets must not take the core: for a while they stay in the kernel's buffer.
             self.counters.add("beacon.paused")
-            self._membership.beacons_lost(time.monotonic())
+            self.membership.beacons_lost(time.monotonic())
             self._filter.overrun = False
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock.fileno())
@@ -256,7 +242,7 @@ class Discovery:
             yield_to_data()
             try:
                 data, source, index = network.receive(sock)
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 return False
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
@@ -266,9 +252,9 @@ class Discovery:
                 beacon, old_key = packet
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
                 if old_key is None:
-                    self._membership.receive(beacon, source, now, multicast=multicast)
+                    self.membership.receive(beacon, source, now, multicast=multicast)
                 else:
-                    self._membership.recognise(beacon, source, old_key)
+                    self.membership.recognise(beacon, source, old_key)
             elif self._filter.overrun:
                 return False
         return True
@@ -276,30 +262,30 @@ class Discovery:
     def _look_again(self) -> bool:
         """Act on a change of the interfaces; return whether they could be listed."""
         try:
-            everything = self._look()
+            everything = self.look()
         except OSError as error:  # no file descriptor is left to ask the kernel
             _log.debug("! interfaces cannot be listed: %s", error)
             return False
         if everything != self._everything:
             self._everything = everything
             self._use_interfaces()
-            if self._on_interfaces(everything):
-                self._membership.interfaces_changed(time.monotonic(), self._other_addresses())
+            if self.on_interfaces(everything):
+                self.membership.interfaces_changed(time.monotonic(), self._other_addresses())
                 self._flush()
         return True
 
     def _other_addresses(self) -> tuple[IPv4Address, ...]:
-        wanted = self._settings.interfaces
+        wanted = self.settings.interfaces
         mine = [i for i in self._everything if i.up and (not wanted or i.name in wanted)]
-        return network.further_addresses(mine, self._identity.guid.address)
+        return network.further_addresses(mine, self.identity.guid.address)
 
     def _use_interfaces(self) -> None:
         """Choose the usable interfaces, and join the group on them."""
-        wanted = self._settings.interfaces
+        wanted = self.settings.interfaces
         before, self.interfaces = self.interfaces, network.choose(self._everything, wanted)
         if problem := network.unknown_names(self._everything, wanted):
             self._warn(problem, "no-interface")
-        if not self._settings.multicast.enabled:
+        if not self.settings.multicast.enabled:
             return
         if self.interfaces != before:
             _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self.interfaces)) or "no interface")
@@ -320,9 +306,9 @@ class Discovery:
             self._set_seeds()
 
     def _set_seeds(self) -> None:
-        default = self._settings.discovery_port
-        seeds = self._settings.seeds
-        self._membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
+        default = self.settings.discovery_port
+        seeds = self.settings.seeds
+        self.membership.set_seeds((a, s.port or default) for s in seeds for a in self._seed_hosts.get(s.host, ()))
         self._flush()
 
     def _warn(self, text: str, code: str) -> None:
@@ -337,7 +323,7 @@ class Discovery:
         self._flushing = True
         try:
             while True:
-                outputs, events = self._membership.outputs(), self._membership.events()
+                outputs, events = self.membership.outputs(), self.membership.events()
                 if not (outputs or events):
                     break
                 for beacon, address, key in outputs:
@@ -348,17 +334,17 @@ class Discovery:
                     if event.change == "conflict":
                         host = str(event.identity.guid.address)
                         self._refusals.refuse(time.monotonic(), f"conflict.{event.reason}", host, event.text)
-                    self._on_event(event)
+                    self.on_event(event)
         finally:
             self._flushing = False
             if self._started:
                 self._timer.arm()
 
     def _send(self, beacon: Beacon, address: Address | None, key: int) -> None:
-        """Send a beacon, signed in a secured mesh; the arguments as for ``announcing.OutgoingBeacon``."""
+        """Send a beacon, signed in a secured mesh; the arguments as for ``endpoints.OutgoingBeacon``."""
         packet = beacon.serialize()
-        if self._trust is not None:
-            packet = self._trust.sign(packet, time.monotonic(), key)
+        if self.trust is not None:
+            packet = self.trust.sign(packet, time.monotonic(), key)
         if address is None:
             _log.debug("> group: %s", beacon)
             self._sender.multicast(packet, self.interfaces)
@@ -367,5 +353,5 @@ class Discovery:
             self._sender.unicast(packet, address)
 
     def _timer_due(self, now: float) -> None:
-        self._membership.handle_timer(now)
+        self.membership.handle_timer(now)
         self._flush()

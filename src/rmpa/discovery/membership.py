@@ -17,19 +17,26 @@ from rmpa.core import limits as core_limits
 from rmpa.core.statistics import Counters
 from rmpa.core.timers import earliest
 from rmpa.discovery import limits
-from rmpa.discovery.announcing import BeaconSender, GossipCandidates
 from rmpa.discovery.beacon import BeaconKind
-from rmpa.discovery.endpoints import LINKED, NEVER, Endpoint, EndpointTable, PeerInstance, shared_address, shared_name
+from rmpa.discovery.endpoints import (
+    LINKED,
+    NEVER,
+    BeaconSender,
+    Endpoint,
+    EndpointTable,
+    GossipCandidates,
+    PeerInstance,
+    shared_address,
+    shared_name,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from ipaddress import IPv4Address
 
     from rmpa.core.identity import Guid, Identity
-    from rmpa.core.timers import Yielder
-    from rmpa.discovery.announcing import OutgoingBeacon
     from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.endpoints import PeerView
+    from rmpa.discovery.endpoints import OutgoingBeacon
 
 # When a starting agent announces itself, in seconds after its start: Wi-Fi loses multicast, so one beacon is not
 # enough.
@@ -93,8 +100,10 @@ class MembershipProtocol:
         identity: This agent's own.
         rng: Uniform numbers in [0, 1), for jitter; seeded by simulations.
         multicast: Whether to send to the group at all.
-        lease: Seconds of silence after which peers may count this agent as gone.
         counters: Where refusals are counted.
+
+    Attributes:
+        endpoints: The peers, also those that a conflict keeps from being members.
     """
 
     def __init__(
@@ -103,13 +112,12 @@ class MembershipProtocol:
         *,
         rng: Callable[[], float],
         multicast: bool = True,
-        lease: float = core_limits.PEER_LEASE,
         counters: Counters | None = None,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
         self._rng = rng
-        self._endpoints = EndpointTable()
-        self._sender = BeaconSender(identity, self._endpoints, lease, self.counters, multicast=multicast)
+        self.endpoints = EndpointTable()
+        self._sender = BeaconSender(identity, self.endpoints, self.counters, multicast)
         self._candidates = GossipCandidates(rng)
         self._reported_names: set[frozenset[bytes]] = set()
         self._seeds: tuple[Address, ...] = ()
@@ -129,8 +137,8 @@ class MembershipProtocol:
         """Announce this agent: a burst of beacons, then only heartbeats."""
         identity = self._sender.identity
         own = PeerInstance(identity, now, now, "link", linked_until=LINKED)
-        self._endpoints[identity.guid.place] = Endpoint({identity.instance: own}, own, own=True)
-        self._endpoints.index(identity.guid.place)
+        self.endpoints[identity.guid.place] = Endpoint({identity.instance: own}, own, own=True)
+        self.endpoints.index(identity.guid.place)
         self._burst = self._burst_times(now, BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -149,18 +157,18 @@ class MembershipProtocol:
             self.counters.add("beacon.echo")
             return
         place = identity.guid.place
-        endpoint = self._endpoints.get(place)
+        endpoint = self.endpoints.get(place)
         if endpoint is None:
             if not self._has_room(now):
                 self.counters.add("roster.full")
                 return
-            endpoint = self._endpoints[place] = Endpoint()
+            endpoint = self.endpoints[place] = Endpoint()
         gossiped = [self._candidates.answered(address) for address in {identity.guid.endpoint, source}]
-        steady = self._endpoints.is_steady(endpoint, beacon)
+        steady = self.endpoints.is_steady(endpoint, beacon)
         run = endpoint.hear(beacon, source, now, multicast=multicast)
         if run is None:
             self.counters.add("beacon.late")
-            self._endpoints.index(place)
+            self.endpoints.index(place)
             return
         # Most heartbeats change nothing but the end of the lease, at which it is settled anyway.
         steady = steady and run.goodbye is None and run.identity == endpoint.member
@@ -203,12 +211,12 @@ class MembershipProtocol:
             source: Where beacons can be sent to it, if that is known to differ from its GUID's endpoint.
         """
         place = identity.guid.place
-        endpoint = self._endpoints.get(place)
+        endpoint = self.endpoints.get(place)
         if endpoint is None:
             if not self._has_room(now, linked=True):
                 self.counters.add("roster.full")
                 return
-            endpoint = self._endpoints[place] = Endpoint()
+            endpoint = self.endpoints[place] = Endpoint()
         if endpoint.own:
             self.counters.add("roster.own_link")
             return
@@ -226,7 +234,7 @@ class MembershipProtocol:
             now: Monotonic seconds.
             instance: The run's; the link of a run that was superseded meanwhile changes nothing.
         """
-        endpoint = self._endpoints.get(guid.place)
+        endpoint = self.endpoints.get(guid.place)
         run = endpoint.current if endpoint is not None and not endpoint.own else None
         if run is None or not run.linked or (instance is not None and run.identity.instance != instance):
             return
@@ -271,7 +279,7 @@ class MembershipProtocol:
             self._unicast_at if self._unicasts else None,
             self._burst[0] if self._burst else None,
             self._candidates.next_timer(),
-            self._endpoints.timers.next(),
+            self.endpoints.timers.next(),
         )
 
     def handle_timer(self, now: float) -> None:
@@ -314,10 +322,6 @@ class MembershipProtocol:
         taken, self._events = self._events, []
         return taken
 
-    def peers(self, yielder: Yielder = iter) -> list[PeerView]:
-        """All peers in GUID order, those included that a conflict keeps from being members."""
-        return self._endpoints.views(yielder)
-
     def silent_seeds(self) -> list[Address]:
         """The seeds at whose address there is no member."""
         met = {host for peer in self._members() for host, _ in peer.addresses} if self._seeds else ()
@@ -326,16 +330,16 @@ class MembershipProtocol:
     @property
     def size(self) -> int:
         """How many members there are."""
-        return len(self._endpoints.members)
+        return len(self.endpoints.members)
 
     def is_verified(self, guid: Guid, instance: bytes) -> bool:
         """Whether this run of a peer has or had a link; this agent itself counts as linked."""
-        endpoint = self._endpoints.get(guid.place)
+        endpoint = self.endpoints.get(guid.place)
         peer = endpoint.current if endpoint is not None else None
         return peer is not None and peer.verified and peer.identity.instance == instance
 
     def _members(self) -> Iterable[PeerInstance]:
-        return self._endpoints.members.values()
+        return self.endpoints.members.values()
 
     def _settle(self, place: int, now: float, *, answer: bool = False) -> bool:
         """Decide anew about an endpoint, one of whose facts has changed, and report what is different.
@@ -348,7 +352,7 @@ class MembershipProtocol:
         Returns:
             Whether a run is a member that was none.
         """
-        endpoint = self._endpoints[place]
+        endpoint = self.endpoints[place]
         before, conflict = endpoint.member, endpoint.conflict
         endpoint.settle(now)
         run = endpoint.current
@@ -369,7 +373,7 @@ class MembershipProtocol:
             self._remove_predecessors(endpoint, run)
         elif run is not None and run.identity != before:
             self._events.append(PeerEvent("changed", run.identity))
-        self._endpoints.index(place)
+        self.endpoints.index(place)
         if run is not None:
             self._report_name_conflict(endpoint)
             if found:
@@ -393,10 +397,10 @@ class MembershipProtocol:
 
     def _remove(self, place: int, reason: str) -> None:
         """Forget an endpoint whatever its facts are."""
-        endpoint = self._endpoints[place]
+        endpoint = self.endpoints[place]
         if endpoint.member is not None:
             self._lost(endpoint, endpoint.member, reason)
-        self._endpoints.remove(place)
+        self.endpoints.remove(place)
 
     def _remove_predecessors(self, endpoint: Endpoint, peer: PeerInstance) -> None:
         """Remove the former run of an agent that was killed and started again at another port, or the former place.
@@ -404,7 +408,7 @@ class MembershipProtocol:
         It has the same name, the same address or instance, and no link. If it is alive after all, its next beacon
         brings it back.
         """
-        for other in self._endpoints.with_name(peer.identity.name):
+        for other in self.endpoints.with_name(peer.identity.name):
             former = other.current
             if (
                 former is not None
@@ -420,7 +424,7 @@ class MembershipProtocol:
 
     def _report_name_conflict(self, endpoint: Endpoint) -> None:
         """Report once that two peers share a name, if both are certainly alive."""
-        for one, other in self._endpoints.same_name(endpoint):
+        for one, other in self.endpoints.same_name(endpoint):
             pair = frozenset({one.identity.instance, other.identity.instance})
             if pair not in self._reported_names:
                 self._reported_names.add(pair)
@@ -429,8 +433,8 @@ class MembershipProtocol:
                 return
 
     def _expire_leases(self, now: float) -> None:
-        for place in sorted(self._endpoints.timers.take(now)):
-            endpoint = self._endpoints.get(place)  # handling an earlier one may have removed it
+        for place in sorted(self.endpoints.timers.take(now)):
+            endpoint = self.endpoints.get(place)  # handling an earlier one may have removed it
             if endpoint is None:
                 continue
             run = endpoint.current
@@ -448,16 +452,16 @@ class MembershipProtocol:
         One that never had a link goes first. For a peer that is only heard none goes but one that never had a link
         and missed a heartbeat.
         """
-        if len(self._endpoints) < (core_limits.PEERS_MAX if linked else limits.STRANGERS_MAX):
+        if len(self.endpoints) < (core_limits.PEERS_MAX if linked else limits.STRANGERS_MAX):
             return True
         strangers, unlinked = 0, []
-        for place, endpoint in self._endpoints.items():  # some thousand, for each forged beacon: no property is asked
+        for place, endpoint in self.endpoints.items():  # some thousand, for each forged beacon: no property is asked
             run = endpoint.current
             had_link, seen = (False, NEVER) if run is None else (run.linked_until != NEVER, run.heard)
             strangers += not had_link
             if run is None or run.linked_until != LINKED:
                 unlinked.append((had_link, max(seen, run.linked_until) if run is not None else seen, place))
-        if not linked and strangers < limits.STRANGERS_MAX and len(self._endpoints) < core_limits.PEERS_MAX:
+        if not linked and strangers < limits.STRANGERS_MAX and len(self.endpoints) < core_limits.PEERS_MAX:
             return True
         had_link, seen, place = min(unlinked, default=(True, now, 0))
         if not unlinked or (not linked and (had_link or seen > now - limits.HEARTBEAT_LATE)):
@@ -480,12 +484,12 @@ class MembershipProtocol:
 
     def _schedule_dissemination(self, now: float) -> None:
         """Schedule gossip about a found peer for the peers that multicast does not reach."""
-        if self._disseminate_at is None and self._heartbeat_at is not None and len(self._endpoints.members) > 1:
+        if self._disseminate_at is None and self._heartbeat_at is not None and len(self.endpoints.members) > 1:
             self._disseminate_at = max(now, self._disseminated_at + self._early_interval())
 
     def _early_interval(self) -> float:
         """Seconds between two beacons of this agent that are sent before the next heartbeat is due."""
-        return max(_DISSEMINATION_INTERVAL, len(self._endpoints.members) / _DISSEMINATIONS_PER_SECOND)
+        return max(_DISSEMINATION_INTERVAL, len(self.endpoints.members) / _DISSEMINATIONS_PER_SECOND)
 
     def _answer_if_unknown(
         self, endpoint: Endpoint, beacon: Beacon, now: float, *, found: bool, multicast: bool
@@ -503,7 +507,7 @@ class MembershipProtocol:
         deaf = not multicast and now - peer.multicast_at <= limits.MULTICAST_SILENCE
         if not (found or deaf or beacon.kind is BeaconKind.ANNOUNCE):
             return
-        members = len(self._endpoints.members)
+        members = len(self.endpoints.members)
         if not (multicast and self._sender.multicast and members > limits.MANY_MEMBERS):
             self._sender.send_answer(peer, now)
         elif self._burst:
@@ -519,7 +523,7 @@ class MembershipProtocol:
             self._send_multicast(BeaconKind.HEARTBEAT, now)
         known = self._sender.heard_lately(self._sender.unheard_by_multicast(now), now)
         for place in self._late_answers:
-            if (endpoint := self._endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
+            if (endpoint := self.endpoints.get(place)) is not None and (peer := endpoint.current) is not None:
                 self._sender.send_answer(peer, now, self._sender.gossip(known, peer))
         self._late_answers.clear()
 
@@ -539,7 +543,7 @@ class MembershipProtocol:
     def _apply_gossip(self, beacon: Beacon, now: float) -> None:
         """Announce this agent to unknown peers of the sender."""
         own = self._sender.identity
-        mentioned = [guid.endpoint for guid in beacon.gossip if guid.place not in self._endpoints]
+        mentioned = [guid.endpoint for guid in beacon.gossip if guid.place not in self.endpoints]
         if beacon.observed:
             met = {*own.endpoints}
             for peer in self._members():

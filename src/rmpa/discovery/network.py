@@ -352,6 +352,7 @@ def failure_code(error: OSError) -> str:
     return "no-interface" if error.errno in _NO_INTERFACE else "multicast-blocked"
 
 
+@dataclass(eq=False)
 class Sender:
     """Sends beacons through the mesh's UDP socket; a failure is logged once, and once more when it is over.
 
@@ -361,13 +362,14 @@ class Sender:
         counters: Where failures are counted.
     """
 
-    def __init__(self, sock: socket.socket, group: Address, counters: Counters) -> None:
-        self._sock = sock
-        self._group = group
-        self._counters = counters
+    sock: socket.socket
+    group: Address
+    counters: Counters
+
+    def __post_init__(self) -> None:
         self._failing: dict[str, int | None] = {}
-        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, limits.MULTICAST_TTL)
-        sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        self.sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, limits.MULTICAST_TTL)
+        self.sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
 
     def multicast(self, data: bytes, interfaces: Iterable[Interface]) -> None:
         """Send to the group on each interface."""
@@ -378,26 +380,26 @@ class Sender:
             source = interface.addresses[0].packed if interface.loopback and interface.addresses else _ANY
             ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, _ANY))]
             try:
-                self._sock.sendmsg([data], ancillary, 0, self._group)
-            except (BlockingIOError, InterruptedError):
-                self._counters.add("beacon.send_full")
+                self.sock.sendmsg([data], ancillary, 0, self.group)
+            except BlockingIOError:
+                self.counters.add("beacon.send_full")
             except OSError as error:
-                self._counters.add("beacon.send_failed")
+                self.counters.add("beacon.send_failed")
                 if self._failing.get(name) != error.errno:
                     self._failing[name] = error.errno
                     text = "! %s: beacons cannot be sent (%s); tried again with each beacon [%s]"
                     _log.warning(text, name, error.strerror, failure_code(error))
             else:
-                self._counters.add("beacon.out_multicast")
+                self.counters.add("beacon.out_multicast")
                 if self._failing.pop(name, None) is not None:
                     _log.info("= %s: works again", name)
 
     def unicast(self, data: bytes, address: Address) -> None:
         """Send to one address; a failure is only counted: the next packet tries again."""
         try:
-            self._sock.sendto(data, address)
+            self.sock.sendto(data, address)
         except (OSError, OverflowError) as error:
-            self._counters.add("beacon.send_failed")
+            self.counters.add("beacon.send_failed")
             _log.debug("> %s:%d: %s", *address, error)
         else:
-            self._counters.add("beacon.out_unicast")
+            self.counters.add("beacon.out_unicast")

@@ -370,6 +370,31 @@ class Hello:
         return Identity(self.guid, self.instance, self.name, self.domain)
 
 
+class Link:
+    """A link with a peer, as the machines of this room know it; the driver's is a subclass.
+
+    Args:
+        identity: The peer's, from the handshake; discovery need not have found it.
+        remote_endpoint: Address and port of the other end.
+        dialled: Whether this side dialled.
+    """
+
+    def __init__(self, identity: Identity, remote_endpoint: tuple[str, int], *, dialled: bool) -> None:
+        self.identity: Final = identity
+        self.remote_endpoint: Final = remote_endpoint
+        self.dialled: Final = dialled
+
+    @property
+    def alive(self) -> bool:
+        """Whether bytes were received lately, at the pace of the link; else the peer may be dead."""
+        raise NotImplementedError
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it is silent although bytes are under way to the peer, so that a new connection may do better."""
+        raise NotImplementedError
+
+
 # The answer to a module for which a mesh has no place; it may join when one becomes free.
 FULL: Final = Refuse(
     Refusal.FULL,
@@ -378,23 +403,13 @@ FULL: Final = Refuse(
 )
 
 
-def judge(
-    hello: Hello,
-    ours: Identity,
-    linked: Identity | None = None,
-    *,
-    dialled: bool = False,
-    alive: bool = True,
-    full: bool = False,
-) -> Refuse | None:
+def judge(hello: Hello, ours: Identity, link: Link | None = None, *, full: bool = False) -> Refuse | None:
     """Decide on a hello: ``None`` accepts the connection.
 
     Args:
         hello: The dialler's hello.
         ours: The identity of this agent.
-        linked: The peer of the link that is up with the hello's address and port; ``None``: there is no such link.
-        dialled: Whether this side dialled that link.
-        alive: Whether bytes were received on it lately; otherwise the peer may be dead.
+        link: The link that is up with the hello's address and port; ``None``: there is none.
         full: Whether there is no place for one more peer.
     """
     if refuse := _judge_identity(hello, ours):
@@ -404,16 +419,16 @@ def judge(
     if hello.expected is not None and hello.expected.place != ours.guid.place:
         text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
-    same_run = linked is not None and linked.instance == hello.instance
+    same_run = link is not None and link.identity.instance == hello.instance
     if hello.lane == Lane.BULK:
         text = "a bulk lane belongs to an express one, and there is none yet"
         return None if same_run else Refuse(Refusal.NO_EXPRESS, text)
-    if linked is None:
+    if link is None:
         return FULL if full else None
     if same_run:
         text = "we are linked already; the link that the lower GUID dialled stays"
-        return Refuse(Refusal.ALREADY_LINKED, text) if dialled and ours.guid < hello.guid else None
-    return _duplicate(hello.guid) if alive else None
+        return Refuse(Refusal.ALREADY_LINKED, text) if link.dialled and ours.guid < hello.guid else None
+    return _duplicate(hello.guid) if link.alive else None
 
 
 def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refuse | None:

@@ -13,13 +13,13 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypeVar
 
 from rmpa.core import limits as core_limits
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.timers import Backoff, TimerQueue, TokenBucket, earliest
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FULL, Hello, Lane, Refusal, Refuse, judge
+from rmpa.mesh.frames import FULL, Hello, Lane, Link, Refusal, Refuse, judge
 from rmpa.trust.permissions import NOT_OF_THIS_MESH, TrustReason
 
 if TYPE_CHECKING:
@@ -58,18 +58,19 @@ _SELDOM_MENDED: Final = frozenset({*Refusal, *TrustReason}) - _UNPROVEN - _OTHER
 REPLACED: Final = "replaced by a newer link"
 # Why a link is no longer used: another run of the peer has taken its place.
 RESTARTED: Final = "the peer restarted"
+_L = TypeVar("_L", bound=Link)
 # What the driver has to do, or the rooms above have to know; see ``Peering.take``.
 PeeringOutput = (
     tuple[Literal["dial"], Guid, tuple[SocketAddress, ...], bool]
-    | tuple[Literal["close"], int, str]
-    | tuple[Literal["up"], int]
-    | tuple[Literal["down"], int, str]
+    | tuple[Literal["close"], _L, str]
+    | tuple[Literal["up"], _L]
+    | tuple[Literal["down"], _L, str]
     | tuple[Literal["refused"], Identity, Refuse]
 )
 
 
 @dataclass(slots=True)
-class Peer:
+class Peer(Generic[_L]):
     """What is known of one peer; only the machine changes it.
 
     It has more than 12 fields: the peer, its link, the present dial, and when and why the next one comes.
@@ -82,9 +83,7 @@ class Peer:
         gone: Whether it is forgotten when its link or dial ends.
         source: The source address of its own beacons.
         good: The endpoint where it was reached last.
-        link: The number of the link that is used with it.
-        linked: The run that this link is with.
-        dialled: Whether this side dialled that link.
+        link: The link that is used with it.
         since: When the link came up, or the last link fell, monotonic seconds; ``None`` before the first link.
         dialling: The endpoints of the present dial.
         hello_at: When the present dial sent its hello.
@@ -105,9 +104,7 @@ class Peer:
     gone: bool = False
     source: str | None = None
     good: SocketAddress | None = None
-    link: int | None = None
-    linked: Identity | None = None
-    dialled: bool = False
+    link: _L | None = None
     since: float | None = None
     dialling: tuple[SocketAddress, ...] = ()
     hello_at: float | None = None
@@ -123,7 +120,7 @@ class Peer:
     @property
     def identity(self) -> Identity:
         """The run that is linked, else the newest one."""
-        return self.linked or self.run
+        return self.run if self.link is None else self.link.identity
 
     @property
     def state(self) -> Literal["linked", "dialling", "waiting", "refused"]:
@@ -153,24 +150,22 @@ class Peer:
         return list(dict.fromkeys([*candidates, *self.run.endpoints]))
 
 
-class Peering:
+class Peering(Generic[_L]):
     """The machine over all peers.
 
     Args:
         ours: The identity of this agent.
         rng: Uniform numbers in [0, 1), for the jitter.
-        alive: Returns whether bytes arrived on a link lately, given its id: within ``quiet_after`` of its keepalive.
 
     Attributes:
         left_out: Whether a mesh that is full has refused this module, and no link has come up since.
     """
 
-    def __init__(self, ours: Identity, *, rng: Callable[[], float], alive: Callable[[int], bool]) -> None:
+    def __init__(self, ours: Identity, *, rng: Callable[[], float]) -> None:
         self._ours = ours
         self._rng = rng
-        self._alive = alive
-        self._peers: dict[int, Peer] = {}
-        self._outputs: list[PeeringOutput] = []
+        self._peers: dict[int, Peer[_L]] = {}
+        self._outputs: list[PeeringOutput[_L]] = []
         self._timers: TimerQueue[int] = TimerQueue()
         # Unverified peers whose dials are due, the one that has been due longest first.
         self._dial_queue: dict[int, None] = {}
@@ -219,15 +214,12 @@ class Peering:
         if peer is not None and hello.lane == Lane.EXPRESS and self._crosses(peer, hello, now):
             text = "we dial each other; the link that the lower GUID dials stays"
             return Refuse(Refusal.ALREADY_LINKED, text)
-        if peer is None or peer.link is None:
-            refuse = judge(hello, self._ours, full=self._full(peer))
-        else:
-            refuse = judge(hello, self._ours, peer.linked, dialled=peer.dialled, alive=self._alive(peer.link))
+        refuse = judge(hello, self._ours, None if peer is None else peer.link, full=self._full(peer))
         if refuse is FULL:
             self.link_refused(hello.guid, refuse)
         return refuse
 
-    def _full(self, peer: Peer | None = None) -> bool:
+    def _full(self, peer: Peer[_L] | None = None) -> bool:
         """Whether the mesh has no place for this peer, or for a new one.
 
         A place is taken by a link, and kept while its peer is away for a moment: until discovery has given it up.
@@ -240,45 +232,37 @@ class Peering:
         """Take in that a dial has a connection, on which the hello is sent next.
 
         Returns:
-            Whether the connection is still wanted. If not, because the peer's own dial led to a link meanwhile, the
-            driver closes it, and this dial is over.
+            Whether the connection is still wanted. If not, because the peer's own dial led to a link meanwhile, or
+            its link is not stuck, the driver closes it, and this dial is over.
         """
         peer = self._peers.get(guid.place)
         if peer is None or not peer.dialling:
             return True
-        if peer.link is None:
+        if peer.link is None or peer.link.stuck:
             peer.hello_at = now
             return True
         peer.dialling = ()
         return False
 
-    def link_up(
-        self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: SocketAddress | None = None
-    ) -> None:
-        """Take in a link whose handshake succeeded.
-
-        Args:
-            link_id: The driver's number for the link, never used twice.
-            identity: The remote side's identity from the handshake; discovery need not have found it.
-            now: Monotonic seconds.
-            dialled: Whether this side dialled.
-            endpoint: The endpoint that this side dialled.
-        """
+    def link_up(self, link: _L, now: float) -> None:
+        """Take in a link whose handshake succeeded."""
+        identity = link.identity
         peer = self._peer(identity)
         counted = bool(peer.dialling) and not peer.verified
-        if dialled:
+        if link.dialled:
             peer.dialling, peer.hello_at = (), None
-            peer.good = endpoint
-        same_run = peer.linked is not None and peer.linked.instance == identity.instance
-        if same_run and peer.dialled != dialled and peer.dialled == (self._ours.guid < identity.guid):
+            peer.good = link.remote_endpoint
+        other, lower = peer.link, self._ours.guid < identity.guid
+        same_run = other is not None and other.identity.instance == identity.instance
+        if other is not None and same_run and other.dialled != link.dialled and other.dialled == lower:
             # Of two links the one that the lower GUID dialled stays; if the same side dialled both, the newer one.
-            self._outputs.append(("close", link_id, "we are linked already; the lower GUID's link stays"))
+            self._outputs.append(("close", link, "we are linked already; the lower GUID's link stays"))
             return
         self._replace(peer, REPLACED if same_run else RESTARTED, now)
         if peer.run.instance != identity.instance:
             peer.run = identity
             peer.backoff.reset()
-        peer.link, peer.linked, peer.dialled, peer.since = link_id, identity, dialled, now
+        peer.link, peer.since = link, now
         peer.pursued_until = -math.inf
         peer.forget_at = peer.refused = None
         self._dial_at(peer, None)
@@ -290,25 +274,34 @@ class Peering:
         peer.gone = self.left_out = False
         peer.tried.clear()
         peer.reported.clear()
-        self._outputs.append(("up", link_id))
+        self._outputs.append(("up", link))
 
-    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False, needed: bool = False) -> None:
+    def link_silent(self, link: _L) -> None:
+        """Try a new connection beside a silent link, as soon as the peer can be reached again, on any path.
+
+        TCP retransmits more and more rarely. The new link replaces this one.
+        """
+        peer = self._peers.get(link.identity.guid.place)
+        if peer is not None and peer.link is link and not peer.dialling:
+            self._dial(peer, briefly=True)
+
+    def link_down(self, link: _L, reason: str, now: float, *, silent: bool = False, needed: bool = False) -> None:
         """Handle the end of a link; without effect for a link that was replaced or never up.
 
         Args:
-            link_id: Its number.
+            link: The link.
             reason: Why, for people.
             now: Monotonic seconds.
             silent: Whether the link ended by silence: the path to the peer failed, and may work again at once.
             needed: Whether something at either side depended on it, so that the peer is worth many attempts.
         """
-        peer = next((peer for peer in self._peers.values() if peer.link == link_id), None)
-        if peer is None:
+        peer = self._peers.get(link.identity.guid.place)
+        if peer is None or peer.link is not link:
             return
         if silent or now - (peer.since or now) >= LINK_STABLE:
             peer.backoff.reset()
-        peer.link, peer.linked, peer.since, peer.last_error = None, None, now, reason
-        self._outputs.append(("down", link_id, reason))
+        peer.link, peer.since, peer.last_error = None, now, reason
+        self._outputs.append(("down", link, reason))
         if not peer.announced and len(self._peers) > core_limits.PEERS_MAX:
             peer.gone = True  # forged identities must not fill the memory, nor cause dials
         if peer.gone:
@@ -333,8 +326,8 @@ class Peering:
         """
         peer = self._dial_ended(guid, endpoint)
         if peer is not None:
-            peer.last_error = error
-            peer.refused = None
+            if peer.link is None:
+                peer.last_error, peer.refused = error, None
             self._retry(peer, now)
 
     def dial_refused(
@@ -342,19 +335,18 @@ class Peering:
     ) -> None:
         """Handle a dial that was refused at this endpoint, by either side; without a proof it is only shown."""
         peer = self._dial_ended(guid, endpoint)
-        if peer is None:
+        if peer is None or peer.link is not None:
             return
         peer.last_error = str(refuse)
         if refuse.code == Refusal.ALREADY_LINKED:
             # The peer has a link that was lost here (it ends within the lease), or that is about to be accepted here.
-            if peer.link is None:
-                self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer, now)))
+            self._dial_at(peer, now + max(limits.EXPRESS_LEASE, self._pause(peer, now)))
             return
         if refuse.code in _UNPROVEN or not proved:
             peer.refused = refuse
         if not proved or refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
             self._retry(peer, now)
-        elif peer.link is None:
+        else:
             peer.refused = refuse
             pause = max(REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
@@ -393,59 +385,54 @@ class Peering:
                 self._dial_due(peer, now)
         self._dial_unverified(now)
 
-    def take(self) -> list[PeeringOutput]:
+    def take(self) -> list[PeeringOutput[_L]]:
         """Return the outputs since the last call, in order.
 
         Returns:
             * ``("dial", guid, endpoints, briefly)``: connect to this peer at the endpoint that answers first, best
               first. With ``briefly`` each gets one short attempt, because the next dial follows soon.
-            * ``("close", link id, reason)``: send a bye on this link and close it.
-            * ``("up", link id)``: this link is the one that is used with its peer.
-            * ``("down", link id, reason)``: the link that was used with its peer is no longer used; the reason is
+            * ``("close", link, reason)``: send a bye on this link and close it.
+            * ``("up", link)``: this link is the one that is used with its peer.
+            * ``("down", link, reason)``: the link that was used with its peer is no longer used; the reason is
               ``REPLACED``, ``RESTARTED``, or how its connection ended.
             * ``("refused", identity, refuse)``: a peer refuses links for a reason that was not reported before.
         """
         outputs, self._outputs = self._outputs, []
         return outputs
 
-    def endpoints(self, guid: Guid) -> list[SocketAddress]:
-        """The endpoints at which a peer may be reached, best first; empty for an unknown peer."""
-        peer = self._peers.get(guid.place)
-        return peer.endpoints() if peer is not None else []
-
-    def peers(self) -> list[Peer]:
+    def peers(self) -> list[Peer[_L]]:
         """All known peers, by GUID."""
         return sorted(self._peers.values(), key=lambda p: p.run.guid)
 
-    def _peer(self, identity: Identity) -> Peer:
+    def _peer(self, identity: Identity) -> Peer[_L]:
         """What is known of the peer at this identity's place; a new record if there is none."""
-        new = Peer(identity, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
+        new: Peer[_L] = Peer(identity, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng))
         return self._peers.setdefault(identity.guid.place, new)
 
-    def _fallback(self, peer: Peer) -> float:
+    def _fallback(self, peer: Peer[_L]) -> float:
         """Seconds that this side waits for the peer's dial: none if it has the lower GUID, and dials first."""
         return 0.0 if self._ours.guid < peer.run.guid else DIAL_FALLBACK
 
-    def _forget_if_idle(self, peer: Peer) -> None:
+    def _forget_if_idle(self, peer: Peer[_L]) -> None:
         """Forget a peer that is gone, unless it has a link or an unanswered dial."""
         peer.forget_at = None
         self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
             self._peers.pop(peer.run.guid.place, None)
 
-    def _restart(self, peer: Peer, now: float) -> None:
+    def _restart(self, peer: Peer[_L], now: float) -> None:
         """Forget the errors and refusals of a peer's former run, because a new run announced itself."""
         peer.backoff.reset()
         peer.tried.clear()
         peer.reported.clear()
         peer.refused = None
-        link, linked = peer.link, peer.linked
-        if link is None or linked is None or linked.instance == peer.run.instance:
+        link = peer.link
+        if link is None or link.identity.instance == peer.run.instance:
             return
-        if linked.guid < peer.run.guid or not self._alive(link):
+        if link.identity.guid < peer.run.guid or not link.alive:
             self._replace(peer, RESTARTED, now)
 
-    def _crosses(self, peer: Peer, hello: Hello, now: float) -> bool:
+    def _crosses(self, peer: Peer[_L], hello: Hello, now: float) -> bool:
         """Whether a hello crosses that of this side, whose link stays.
 
         The link of the hello would be replaced a round trip later, with the calls that are made over it meanwhile. An
@@ -457,13 +444,13 @@ class Peering:
         same_run = peer.run.instance == hello.instance
         return same_run and now - peer.hello_at < _CROSSING_TIME
 
-    def _replace(self, peer: Peer, reason: str, now: float) -> None:
+    def _replace(self, peer: Peer[_L], reason: str, now: float) -> None:
         """Close a peer's link, if there is one: another link replaces it, or another run of the peer."""
         if peer.link is not None:
             self._outputs += [("close", peer.link, reason), ("down", peer.link, reason)]
-            peer.link, peer.linked, peer.since = None, None, now
+            peer.link, peer.since = None, now
 
-    def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> Peer | None:
+    def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> Peer[_L] | None:
         """End a peer's dial, and mark the endpoint (``None``: all dialled ones) as tried.
 
         Returns:
@@ -482,50 +469,53 @@ class Peering:
             return None
         return peer
 
-    def _retry(self, peer: Peer, now: float) -> None:
+    def _retry(self, peer: Peer[_L], now: float) -> None:
         """Try the other endpoints at once, or wait when all were tried."""
         if peer.link is not None:
-            return
-        if peer.tried.issuperset(peer.endpoints()):
+            self._dial_at(peer, None if peer.link.alive else now + limits.REDIAL_PAUSE)
+        elif peer.tried.issuperset(peer.endpoints()):
             peer.tried.clear()
             peer.good = None
             self._dial_at(peer, now + self._pause(peer, now))
         else:
             self._dial_at(peer, now)
 
-    def _cap(self, peer: Peer) -> float:
+    def _cap(self, peer: Peer[_L]) -> float:
         """The longest pause between dials, in seconds: unverified peers share the rate of all of them."""
         if peer.verified:
             return limits.BACKOFF_MAX
         unverified = sum(not each.verified for each in self._peers.values())
         return max(limits.BACKOFF_MAX, unverified / limits.DIAL_STRANGERS_RATE)
 
-    def _pause(self, peer: Peer, now: float) -> float:
+    def _pause(self, peer: Peer[_L], now: float) -> float:
         if now < peer.pursued_until:
             pursued = sum(now < each.pursued_until for each in self._peers.values())
             return max(limits.REDIAL_PAUSE, pursued / PURSUITS_PER_SECOND) * (0.5 + self._rng())
         peer.backoff.cap = self._cap(peer)
         return peer.backoff.delay()
 
-    def _set_timer(self, peer: Peer) -> None:
+    def _set_timer(self, peer: Peer[_L]) -> None:
         place = peer.run.guid.place
         attempt = None if place in self._dial_queue else peer.next_attempt
         self._timers.set(place, earliest(attempt, peer.forget_at))
 
-    def _dial_at(self, peer: Peer, when: float | None) -> None:
+    def _dial_at(self, peer: Peer[_L], when: float | None) -> None:
         """Set the time of the next dial; ``None``: never."""
         place = peer.run.guid.place
         peer.next_attempt = when
         self._dial_queue.pop(place, None)
         self._set_timer(peer)
 
-    def _dial_due(self, peer: Peer, now: float) -> None:
+    def _dial_due(self, peer: Peer[_L], now: float) -> None:
         """Dial a peer whose dial is due; an unverified one joins the queue instead."""
         due = peer.next_attempt
-        if due is None or now < due or peer.link is not None or peer.dialling:
+        if due is None or now < due or peer.dialling:
+            return
+        if peer.link is not None and peer.link.alive:
+            self._dial_at(peer, None)
             return
         if peer.verified:
-            self._dial(peer, briefly=now < peer.pursued_until)
+            self._dial(peer, briefly=peer.link is not None or now < peer.pursued_until)
             return
         self._dial_queue[peer.run.guid.place] = None
         self._set_timer(peer)
@@ -546,7 +536,7 @@ class Peering:
             self._dial(newest or queue[0])
         self._queue_at = self._dial_rate.next(now) if self._dial_queue else None
 
-    def _dial(self, peer: Peer, *, briefly: bool = False) -> None:
+    def _dial(self, peer: Peer[_L], *, briefly: bool = False) -> None:
         self._dial_at(peer, None)
         left = [e for e in peer.endpoints() if e not in peer.tried]
         if not left:

@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.core.statistics import Counters
     from rmpa.core.timers import Yielder
+    from rmpa.discovery.beacon import Stranger
     from rmpa.discovery.discovery import Discovery
     from rmpa.discovery.endpoints import PeerView
-    from rmpa.discovery.packet_filter import Stranger
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import Peer
     from rmpa.ros.core.external import Core
@@ -182,9 +183,9 @@ class SnapshotBuilder:
             return (), ()
         (identity, mesh, discovery), now = endpoint, time.monotonic()
         links = {session.link.guid: session for session in self.facts.bridge.sessions.linked()}
-        roster = {view.run.identity.guid: view for view in discovery.peers(yielding_to_data)}
+        roster = {view.run.identity.guid: view for view in discovery.membership.endpoints.views(yielding_to_data)}
         yield_to_data()
-        statuses = {status.identity.guid: status for status in mesh.peers()}
+        statuses = {status.identity.guid: status for status in mesh.peering.peers()}
         known_guids = {*roster, *statuses, *links}
         infos = [
             self._peer(roster.get(guid), statuses.get(guid), links.get(guid), now)
@@ -211,7 +212,9 @@ class SnapshotBuilder:
         peers = [info for info in infos if info.state not in (FOREIGN, PENDING)]
         return mark_shared_addresses(peers, own, yielding_to_data), tuple(strange)
 
-    def _peer(self, view: PeerView | None, status: Peer | None, session: PeerSession | None, now: float) -> PeerInfo:
+    def _peer(
+        self, view: PeerView | None, status: Peer[PeerLink] | None, session: PeerSession | None, now: float
+    ) -> PeerInfo:
         run = view.run if view is not None else None
         identity = (run or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         since = status.since if status is not None and status.since is not None else run.since if run else now

@@ -37,7 +37,7 @@ from rmpa.record.ring import RingThread
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.files import replace_file
+from rmpa.runtime.programs import replace_file
 from rmpa.runtime.tasks import OwnedTasks, keep_task, start_task
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from rmpa.resource.adaptation import CoolDown
 from rmpa.resource.quality import Attribute, Direction, Requirement, Value, find_attribute, parse_requirement
 from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.runtime.accept import in_thread
-from rmpa.runtime.files import replace_file, set_aside
+from rmpa.runtime.programs import replace_file, set_aside
 from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ import socket
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -164,20 +165,14 @@ class Descriptors:
             problem=self.problem,
         )
 
-    def open_socket(
-        self,
-        use: Use,
-        family: int = socket.AF_INET,
-        kind: int = socket.SOCK_STREAM,
-        what: str = "a new connection",
-    ) -> socket.socket:
-        """A new non-blocking socket, if there is a descriptor left for ``use``.
+    def open_socket(self, use: Use, family: int = socket.AF_INET, what: str = "a new connection") -> socket.socket:
+        """A new non-blocking stream socket, if there is a descriptor left for ``use``.
 
         Raises:
             OSError: There is no descriptor left (``EMFILE``; counted and logged), or another error.
         """
         try:
-            sock = socket.socket(family, kind | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+            sock = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
         except OSError as error:
             if error.errno in OUT_OF_DESCRIPTORS:
                 self.refuse(use, what, error)
@@ -305,6 +300,7 @@ _GONE: Final = frozenset(
 )
 
 
+@dataclass(eq=False)
 class Acceptor:
     """Hands each connection of ``sock`` to ``on_accept``, a few at a time.
 
@@ -320,23 +316,15 @@ class Acceptor:
             next iteration; returns whether there was one.
     """
 
-    def __init__(
-        self,
-        sock: socket.socket,
-        on_accept: Callable[[socket.socket, Any], None],
-        *,
-        name: str,
-        use: Use = Use.DATA,
-        at_once: int = limits.ACCEPTS,
-        make_room: Callable[[], bool] | None = None,
-    ) -> None:
-        sock.setblocking(False)
-        self._sock = sock
-        self._on_accept = on_accept
-        self._name = name
-        self._use = use
-        self._at_once = at_once
-        self._make_room = make_room
+    sock: socket.socket
+    on_accept: Callable[[socket.socket, Any], None]
+    name: str
+    use: Use = Use.DATA
+    at_once: int = limits.ACCEPTS
+    make_room: Callable[[], bool] | None = None
+
+    def __post_init__(self) -> None:
+        self.sock.setblocking(False)
         self._refusals = RefusalLog(_log, DESCRIPTORS.counters)
         self._listening = False
         self._closed = False
@@ -345,7 +333,7 @@ class Acceptor:
     @property
     def address(self) -> Any:
         """The address that the socket listens at, as ``getsockname`` returns it."""
-        return self._sock.getsockname()
+        return self.sock.getsockname()
 
     @property
     def paused(self) -> bool:
@@ -356,7 +344,7 @@ class Acceptor:
         """Begin to accept."""
         self._timer = None
         if not self._listening and not self._closed:
-            asyncio.get_running_loop().add_reader(self._sock.fileno(), self._acceptable)
+            asyncio.get_running_loop().add_reader(self.sock.fileno(), self._acceptable)
             self._listening = True
 
     def pause(self, seconds: float) -> None:
@@ -372,33 +360,33 @@ class Acceptor:
             self._timer.cancel()
             self._timer = None
         self._closed = True
-        self._sock.close()
+        self.sock.close()
 
     def _stop(self) -> None:
         if self._listening:
-            asyncio.get_running_loop().remove_reader(self._sock.fileno())
+            asyncio.get_running_loop().remove_reader(self.sock.fileno())
             self._listening = False
 
     def _acceptable(self) -> None:
-        for _ in range(self._at_once):
+        for _ in range(self.at_once):
             if self._closed or self._timer is not None:
                 return  # ``on_accept`` closed or paused this acceptor
-            if self._make_room is not None and not self._has_room() and self._make_room():
+            if self.make_room is not None and not self._has_room() and self.make_room():
                 return
             try:
-                sock, address = self._sock.accept()
-            except (BlockingIOError, InterruptedError):
+                sock, address = self.sock.accept()
+            except BlockingIOError:
                 return
             except OSError as error:
                 if error.errno in _GONE:
                     continue
                 self._failed(error)
                 return
-            if not DESCRIPTORS.keeps(self._use, sock, f"a connection to {self._name}"):
+            if not DESCRIPTORS.keeps(self.use, sock, f"a connection to {self.name}"):
                 continue
             try:
                 sock.setblocking(False)
-                self._on_accept(sock, address)
+                self.on_accept(sock, address)
             except BaseException:
                 sock.close()
                 raise
@@ -406,19 +394,19 @@ class Acceptor:
     def _has_room(self) -> bool:
         """Whether these connections may take the lowest free descriptor, whose number a duplicate shows."""
         try:
-            lowest = os.dup(self._sock.fileno())
+            lowest = os.dup(self.sock.fileno())
         except OSError:
             return False
         os.close(lowest)
-        return DESCRIPTORS.has_room(self._use, lowest)
+        return DESCRIPTORS.has_room(self.use, lowest)
 
     def _failed(self, error: OSError) -> None:
         if error.errno in OUT_OF_DESCRIPTORS:
-            DESCRIPTORS.refuse(self._use, f"a connection to {self._name}", error)
+            DESCRIPTORS.refuse(self.use, f"a connection to {self.name}", error)
         else:
             now, pause = asyncio.get_running_loop().time(), limits.ACCEPT_PAUSE
-            text = f"{self._name} cannot accept connections: {error.strerror}; next attempt in {pause:g} s"
-            self._refusals.refuse(now, "accept.failed", self._name, text)
+            text = f"{self.name} cannot accept connections: {error.strerror}; next attempt in {pause:g} s"
+            self._refusals.refuse(now, "accept.failed", self.name, text)
         self.pause(limits.ACCEPT_PAUSE)
 
 

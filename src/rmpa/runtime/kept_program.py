@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Self
 
 import msgspec
 
-from rmpa.runtime.files import replace_file
-from rmpa.runtime.programs import ProgramMark, end_program, ended, how_ended
+from rmpa.runtime.programs import ProgramMark, end_program, ended, how_ended, replace_file
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Programs that are started for the user: they outlive the process that started them; their logs and figures.
+"""Programs that outlive their starter: their logs, their figures, and the files that programs keep.
 
 Such a program has a session of its own and writes its output into a file, so it goes on when its starter is killed.
 The next starter finds it by a ``ProgramMark``, which the kernel gives to no second process.
@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self
 import msgspec
 
 from rmpa.runtime import limits
-from rmpa.runtime.files import replace_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -43,6 +42,42 @@ _KILLED: Final = 5.0
 _CAP_AMBIENT, _CLEAR_ALL = 47, 4
 # The states of proc_pid_stat(5) of a process that has ended.
 _ENDED: Final = ("Z", "X")
+# Files of one name that are set aside.
+_KEPT: Final = 9
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Replace a file, so that a crash at any moment leaves the old one or the new one; readable by its owner alone.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    new = path.with_name(f"{path.name}.new")
+    with open(new, "wb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+
+
+def set_aside(path: Path, what: str) -> Path:
+    """Rename a file to NAME.WHAT, or to the first free one of NAME.WHAT-2 to -9; only the last is ever replaced.
+
+    The first one may be the only copy of parameters set by hand.
+
+    Args:
+        path: The file.
+        what: The ending.
+
+    Returns:
+        The new path.
+
+    Raises:
+        OSError: It cannot be renamed.
+    """
+    names = [f"{path.name}.{what}", *(f"{path.name}.{what}-{number}" for number in range(2, _KEPT + 1))]
+    free = [aside for name in names if not (aside := path.with_name(name)).exists()]
+    return path.replace(free[0] if free else path.with_name(names[-1]))
 
 
 class ProcessFigures(NamedTuple):

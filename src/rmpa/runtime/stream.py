@@ -94,9 +94,6 @@ class Stream:
         on_close: Called once when the socket is gone, from the loop and never from within a method: with ``None``
             after an orderly end, with the error otherwise. Not called after ``close()``.
         outbox: The queue of the bytes that the socket does not take; entries that are in it already are sent first.
-        frame: Makes the header of each fragment of an opened message; must be the outbox's own. Without it opened
-            messages are sent without headers.
-        keep: Whether entries stay in the outbox when the socket is gone, for the next stream.
         secure: Encrypts and decrypts what ``sock`` carries; bytes that it holds already are delivered soon.
     """
 
@@ -107,8 +104,6 @@ class Stream:
         on_bytes: OnBytes,
         on_close: OnClose,
         outbox: Outbox,
-        frame: Framer | None = None,
-        keep: bool = False,
         secure: SecureSocket | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -118,8 +113,10 @@ class Stream:
         self._on_close = on_close
         # The queue of the waiting bytes, with the counts of dropped entries.
         self.outbox = outbox
-        self._frame = frame
-        self._keep = keep
+        # Makes the header of each fragment of an opened message; without it opened messages are sent without headers.
+        self._frame: Framer | None = None
+        # Whether entries stay in the outbox when the socket is gone, for the next stream.
+        self._keep = False
         self._buffer = bytearray(_FIRST_BUFFER)
         self._view = memoryview(self._buffer)
         self._filled = 0
@@ -209,7 +206,12 @@ class Stream:
             self._send_now((data,), key)
 
     def adopt(self, outbox: Outbox, frame: Framer | None) -> None:
-        """Send from another outbox from now on, its present entries first; it is kept when the socket is gone."""
+        """Send from another outbox from now on, its present entries first; it is kept when the socket is gone.
+
+        Args:
+            outbox: The outbox.
+            frame: Makes the headers of fragments; must be the outbox's own.
+        """
         self._uncork()
         rest = b"".join(self.outbox.head(1 << 20))
         self.outbox.clear()
@@ -244,7 +246,7 @@ class Stream:
         try:
             while sent < size:
                 sent += self._sock.sendmsg(unsent(parts, sent) if sent else parts)
-        except (BlockingIOError, InterruptedError):
+        except BlockingIOError:
             pass
         except OSError as error:
             self._lost(error)
@@ -477,7 +479,7 @@ class Stream:
             return  # within ``_read_held``, whose handlers yield to data: its bytes come first
         try:
             count = self._sock.recv_into(self._view[self._filled :])
-        except (BlockingIOError, InterruptedError):
+        except BlockingIOError:
             return
         except OSError as error:
             self._lost(error)
@@ -559,7 +561,7 @@ class Stream:
             parts = self.outbox.head(_IOV, self._loop.time())
             try:
                 sent = self._sock.sendmsg(parts) if parts or self._secure is not None else 0
-            except (BlockingIOError, InterruptedError):
+            except BlockingIOError:
                 return
             except OSError as error:
                 self._lost(error)

@@ -264,7 +264,7 @@ class SecureSocket:
     def _send(self, ciphertext: Buffer) -> None:
         try:
             sent = self._transmit(ciphertext)
-        except (BlockingIOError, InterruptedError):
+        except BlockingIOError:
             sent = 0
         if sent < len(ciphertext):
             self._unsent = memoryview(ciphertext)[sent:]

@@ -211,7 +211,7 @@ class CertificateRequest:
 
 @dataclass(frozen=True, slots=True)
 class ModuleCertificate:
-    """What a module's certificate says, once it was verified.
+    """What a module's certificate says, which the CA has signed.
 
     Args:
         name: The module's.
@@ -235,7 +235,17 @@ class ModuleCertificate:
         return self.issued + (self.expires - self.issued) * limits.RENEWAL_SHARE
 
     def judge(self, wall: float | None, name: str = "", deny: DenyList | None = None, grace: float = 0.0) -> None:
-        """Check times, name and revocation; arguments and errors as for ``verify``."""
+        """Check times, name and revocation.
+
+        Args:
+            wall: Seconds since 1970; ``None`` checks no times, for a module whose clock is not set.
+            name: The module that it must be of; empty for any.
+            deny: The names that were revoked.
+            grace: Seconds for which an expired certificate is still accepted, to be renewed.
+
+        Raises:
+            TrustError: It is not valid yet, expired, of another module, or revoked; the first of these.
+        """
         begin = self.issued - limits.CERTIFICATE_BACKDATE
         if wall is not None and wall < begin:
             text = f"the certificate of {self.name} begins in {begin - wall:.0f} s: one of the clocks is off"
@@ -322,7 +332,6 @@ def issue(
     ca_key: ec.EllipticCurvePrivateKey,
     serial: int,
     wall: float,
-    lifetime: float = limits.CERTIFICATE_LIFETIME,
     hosts: Iterable[str] = (),
 ) -> bytes:
     """A certificate (DER) for a request. Nothing of the request but its name and key is taken over.
@@ -333,14 +342,13 @@ def issue(
         ca_key: Its key.
         serial: A random positive number of at most 159 bits.
         wall: Seconds since 1970.
-        lifetime: Seconds of its validity from now on.
         hosts: Names and addresses of its page, as the authority grants them.
     """
     authority = x509.load_der_x509_certificate(ca)
     issuer = _elliptic(authority.public_key())
     key = _elliptic(serialization.load_der_public_key(request.public_key))
     names = (*server_names(request.name), "127.0.0.1", *hosts)
-    begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + lifetime)
+    begin, end = _time(wall - limits.CERTIFICATE_BACKDATE), _time(wall + limits.CERTIFICATE_LIFETIME)
     certificate = (
         _builder(_name(request.name), authority.subject, key, serial, begin, end, ca=False)
         .add_extension(x509.ExtendedKeyUsage(_PURPOSES), critical=False)
@@ -363,47 +371,33 @@ def read_request(data: bytes) -> CertificateRequest:
         request = x509.load_der_x509_csr(data)
         key = request.public_key()
         valid = isinstance(key, ec.EllipticCurvePublicKey) and request.is_signature_valid
-        name, hosts = _module_name(request), page_hosts(sorted(_hosts_in(request)))
+        name, hosts = _names_in(request)
     except _UNREADABLE as error:
         raise TrustError(TrustReason.FOREIGN, f"the request cannot be read: {error!s:.200}") from None
     if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != CURVE.name:
         raise TrustError(TrustReason.FOREIGN, f"the request's key is not of {CURVE.name}")
     if not valid:
         raise TrustError(TrustReason.FOREIGN, "the request is not signed with its own key")
-    return CertificateRequest(name, _public_bytes(key), hosts)
+    return CertificateRequest(name, _public_bytes(key), page_hosts(sorted(hosts)))
 
 
-def verify(
-    data: bytes, ca: bytes, wall: float | None, *, name: str = "", deny: DenyList | None = None, grace: float = 0.0
-) -> ModuleCertificate:
-    """Verify a module's certificate.
+def read_certificate(data: bytes, ca: bytes) -> ModuleCertificate:
+    """Read a module's certificate; whether it holds now, its ``judge`` says.
 
     Args:
         data: The certificate (DER).
         ca: The CA's (DER), which this module trusts.
-        wall: Seconds since 1970; ``None`` checks no times, for a new module whose clock is not set.
-        name: The module that it must be of; empty for any.
-        deny: The names that were revoked.
-        grace: Seconds for which an expired certificate is still accepted, to be renewed.
 
     Raises:
-        TrustError: It is of another CA, not valid yet, expired, of another module, or revoked; the first of
-            these.
+        TrustError: It is too long, malformed, of another CA, or not one of a module.
     """
-    found = _read(data, ca)
-    found.judge(wall, name, deny, grace)
-    return found
-
-
-def _read(data: bytes, ca: bytes) -> ModuleCertificate:
-    """What a certificate says, if the CA has signed it for a module."""
     if len(data) > limits.CERTIFICATE_MAX:
         raise TrustError(TrustReason.FOREIGN, f"a certificate of {len(data)} bytes")
     authority = x509.load_der_x509_certificate(ca)
     try:
         certificate = x509.load_der_x509_certificate(data)
         certificate.verify_directly_issued_by(authority)
-        name, hosts = _module_name(certificate), _hosts_in(certificate)
+        name, hosts = _names_in(certificate)
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
         key = certificate.public_key()
     except InvalidSignature:
@@ -448,31 +442,25 @@ def ca_public_key(ca: bytes) -> ec.EllipticCurvePublicKey:
         raise TrustError(TrustReason.FOREIGN, f"the CA's certificate cannot be read: {error!s:.200}") from None
 
 
-def _module_name(holder: x509.Certificate | x509.CertificateSigningRequest) -> str:
-    """The module that a certificate or a request is of.
+def _names_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> tuple[str, frozenset[str]]:
+    """The module that a certificate or a request is of, and the names and addresses of its page.
 
     Raises:
         ValueError: SAN and CN do not have one and the same valid name.
     """
-    names = [attribute.value for attribute in holder.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    common = [attribute.value for attribute in holder.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
     try:
         alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         raise ValueError("it has no subject alternative name") from None
     uris = alternative.get_values_for_type(x509.UniformResourceIdentifier)
-    if len(uris) != 1 or not uris[0].startswith(URN) or names != [uris[0].removeprefix(URN)]:
+    if len(uris) != 1 or not uris[0].startswith(URN) or common != [uris[0].removeprefix(URN)]:
         raise ValueError(f"it does not have one name, as CN and as {URN}NAME")
     name = uris[0].removeprefix(URN)
     if problem := peer_name_problem(name):
         raise ValueError(problem)
-    return name
-
-
-def _hosts_in(holder: x509.Certificate | x509.CertificateSigningRequest) -> frozenset[str]:
-    """The names and addresses in a SAN that ``_module_name`` has read."""
-    alternative = holder.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     addresses = map(str, alternative.get_values_for_type(x509.IPAddress))
-    return frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
+    return name, frozenset((*alternative.get_values_for_type(x509.DNSName), *addresses))
 
 
 def _elliptic(key: object) -> ec.EllipticCurvePublicKey:

@@ -10,12 +10,13 @@ import contextlib
 import hmac
 import logging
 import ssl
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.trust import certificates, limits, tokens
-from rmpa.trust.certificates import DenyList, KeyList, read_document
+from rmpa.trust.certificates import DenyList, KeyList, read_certificate, read_document
 from rmpa.trust.membership import new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, CERTIFICATE, KEY, MemberFiles, join_context, member_context
@@ -34,27 +35,22 @@ _log = logging.getLogger(__name__)
 _READ = 16 * 1024
 
 
+@dataclass(eq=False)
 class JoinServer:
     """The authority's end of joins and renewals.
 
     Args:
         authority: Issues the certificates.
         clock: Monotonic seconds.
-        is_linked: Whether a member that is linked has a name.
         counters: Counts what is refused: ``trust.join_refused``, ``trust.renewal_refused``.
     """
 
-    def __init__(
-        self,
-        authority: MeshAuthority,
-        clock: SystemClock,
-        is_linked: Callable[[str], bool],
-        counters: Counters,
-    ) -> None:
-        self._authority = authority
-        self._clock = clock
-        self._refusals = RefusalLog(_log, counters)
-        self._is_linked = is_linked
+    authority: MeshAuthority
+    clock: SystemClock
+    counters: Counters
+
+    def __post_init__(self) -> None:
+        self._refusals = RefusalLog(_log, self.counters)
         # What came of each token, by its id.
         self._steps: dict[bytes, JoinStep] = {}
         # Set, and replaced, at each step.
@@ -105,14 +101,14 @@ class JoinServer:
                 return self._join(asked, host)
             if not isinstance(asked, tokens.Renew) or presented is None:
                 raise RemoteProtocolError("a join or renewal that begins with something else than its question")
-            before = self._authority.judge_renewal(presented)
-            grant = self._authority.grant(asked.request, before.name)
+            before = self.authority.judge_renewal(presented)
+            grant = self.authority.grant(asked.request, before.name)
             _log.info("= %s at %s has a new certificate; it was away", before.name, host)
         except TrustError as error:
             refused = tokens.JoinRefused(error.reason.label, str(error))
         except StartError as error:
             refused = tokens.JoinRefused(
-                "clock" if self._authority.membership.wall() is None else "authority", str(error)
+                "clock" if self.authority.membership.wall() is None else "authority", str(error)
             )
         else:
             return grant
@@ -121,28 +117,27 @@ class JoinServer:
     def _refuse(self, what: str, host: str, refused: tokens.JoinRefused) -> tokens.JoinRefused:
         """Log what each connection can repeat, within limits."""
         text = f"refused a {what} by {host} ({refused.reason}): {refused.text}"
-        self._refusals.refuse(self._clock.now(), f"trust.{what}_refused", host, text)
+        self._refusals.refuse(self.clock.now(), f"trust.{what}_refused", host, text)
         return refused
 
     def _join(self, asked: tokens.Join, host: str) -> tokens.CertificateGrant | tokens.JoinRefused:
         """Let a module join: its token is used, also after a crash, before a certificate is issued."""
-        book, authority = self._authority.book, self._authority
-        name = certificates.read_request(asked.request).name
-        invitation = book.find(asked.token)
-        problem = book.judge(asked.token, name, authority.wall())
-        # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
-        server = self._authority.membership.files.certificate
-        proof = tokens.proof_of(invitation.key if invitation is not None else b"", asked.request, server)
-        if problem:
+        authority, name = self.authority, certificates.read_request(asked.request).name
+        invitation = authority.invitations.get(asked.token)
+        problem = "token" if invitation is None else invitation.problem(name, authority.wall())
+        if invitation is None or problem:
+            # The refusal of a token that is used or has ended is no secret: its id is known to its holder alone.
             refused = tokens.JoinRefused(problem, f"{name} cannot join: the token {tokens.TOKEN_PROBLEMS[problem]}")
-        elif not hmac.compare_digest(proof, asked.proof):
+        elif not hmac.compare_digest(
+            tokens.proof_of(invitation.key, asked.request, authority.membership.files.certificate), asked.proof
+        ):
             refused = tokens.JoinRefused("token", "the request is not signed with the token's key")
-        elif self._is_linked(name) or authority.has_issued(name, invitation.name if invitation is not None else ""):
+        elif authority.is_member(name, invitation.name):
             refused = tokens.JoinRefused(
                 "taken", f"a module named {name} is a member: choose another --name, or revoke it"
             )
         else:
-            book.use(asked.token, name, authority.wall())
+            invitation.used_by, invitation.key = name, b""
             authority.save_tokens()
             grant = authority.grant(asked.request)
             self._step(asked.token, "joined", name)
@@ -257,7 +252,7 @@ async def join_mesh(token: Token, name: str) -> MemberFiles:
     grant, server = await _ask(str(token.address), token.port, join_context(), question)
     try:
         certificates.check_ca(grant.ca, token.fingerprint)
-        certificates.verify(server, grant.ca, None)
+        read_certificate(server, grant.ca)
         check_grant(grant, name, request)
     except TrustError as error:
         raise _refused(error.reason.label, str(error)) from None
@@ -271,7 +266,8 @@ def check_grant(grant: tokens.CertificateGrant, name: str, request: bytes) -> No
         TrustError: The certificate is of another CA, module or key.
         RemoteProtocolError: A document is malformed, or not signed by the CA.
     """
-    found = certificates.verify(grant.certificate, grant.ca, None, name=name)
+    found = read_certificate(grant.certificate, grant.ca)
+    found.judge(None, name)
     if found.public_key != certificates.read_request(request).public_key:
         raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
     key = certificates.ca_public_key(grant.ca)
@@ -286,7 +282,7 @@ async def renew_at_authority(membership: Membership, address: str, port: int) ->
     files = store.path(CERTIFICATE), store.path(KEY)
 
     def question(server: bytes) -> tokens.Renew:
-        name = certificates.verify(server, membership.files.ca, None).name
+        name = membership.read_member(server).name
         if name != membership.keys.authority:
             raise RemoteProtocolError(f"the module at {address}:{port} is {name}, not the authority")
         return tokens.Renew(membership.request())
@@ -349,7 +345,7 @@ def status_of(
                 name=each.name,
                 used_by=each.used_by,
             )
-            for each in (authority.book.invitations if authority is not None else ())
+            for each in (authority.invitations.values() if authority is not None else ())
         ),
         problems=problems_of(membership, name),
     )

@@ -10,7 +10,7 @@ import logging
 import os
 import ssl
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 from cryptography.hazmat.primitives import serialization
@@ -18,8 +18,17 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, StartError
+from rmpa.core.identity import peer_name_problem
 from rmpa.trust import certificates, limits
-from rmpa.trust.certificates import CURVE, DenyList, KeyList, ModuleCertificate, read_document, sign
+from rmpa.trust.certificates import (
+    CURVE,
+    DenyList,
+    KeyList,
+    ModuleCertificate,
+    read_certificate,
+    read_document,
+    sign,
+)
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import Document, TrustError, TrustReason, server_names
 from rmpa.trust.store import (
@@ -35,10 +44,10 @@ from rmpa.trust.store import (
     member_context,
     unusable,
 )
-from rmpa.trust.tokens import CertificateGrant, Token, fingerprint_of
+from rmpa.trust.tokens import CertificateGrant, Invitation, Token, fingerprint_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from ipaddress import IPv4Address
 
     from rmpa.runtime.loop import SystemClock
@@ -86,21 +95,19 @@ class Membership:
     Args:
         store: The files, which newer documents are written to.
         files: What is in them.
-        clock: Monotonic seconds.
-        wall: Seconds since 1970, by the machine's clock, set or not.
+        clock: The machine's clocks, set or not.
 
     Raises:
         StartError: A file is broken, or they do not belong together.
     """
 
-    def __init__(self, store: TrustStore, files: MemberFiles, clock: SystemClock, wall: Callable[[], float]) -> None:
+    def __init__(self, store: TrustStore, files: MemberFiles, clock: SystemClock) -> None:
         self.store = store
         self.files = files
         self._clock = clock
-        self._machine_wall = wall
         with _named(store, CERTIFICATE):
             self._ca_key = certificates.ca_public_key(files.ca)
-            self.certificate = certificates.verify(files.certificate, files.ca, None)
+            self.certificate = read_certificate(files.certificate, files.ca)
         with _named(store, KEYS):
             # The list of group keys that holds.
             self.keys = read_document(files.keys, self._ca_key, KeyList)
@@ -112,14 +119,12 @@ class Membership:
         self.packets = PacketTrust(self.ring, self.wall)
         # Called after a newer deny list holds: links that match end at once.
         self.on_denied: list[Callable[[], None]] = []
-        # Writes one file of the store.
-        self.save: Callable[[str, bytes], None] = store.write
         self._make_contexts()
 
     @classmethod
-    def load(cls, store: TrustStore, clock: SystemClock, wall: Callable[[], float]) -> Membership:
+    def load(cls, store: TrustStore, clock: SystemClock) -> Membership:
         """Read the files of a member; arguments and errors as for the class."""
-        return cls(store, store.load(), clock, wall)
+        return cls(store, store.load(), clock)
 
     def __repr__(self) -> str:
         """Name and numbers alone: secrets never come into a log."""
@@ -140,26 +145,26 @@ class Membership:
 
     def wall(self) -> float | None:
         """Seconds since 1970; ``None`` while the machine's clock is not set."""
-        wall = self._machine_wall()
+        wall = self._clock.wall_ns() / 1e9
         return wall if wall > self.certificate.issued - limits.CERTIFICATE_BACKDATE else None
 
-    def judge_member(self, certificate: Mapping[str, Any] | bytes, claimed: str | None) -> None:
-        """Check the other end's certificate behind a TLS handshake, which has checked the chain.
-
-        Args:
-            certificate: As ``SSLObject.getpeercert()`` returns it, or in DER; its chain is then verified here.
-            claimed: The name in its hello; ``None``: not known yet.
+    def read_member(self, certificate: bytes | None) -> ModuleCertificate:
+        """What the certificate (DER) of another module says, if it is one of this mesh.
 
         Raises:
-            TrustError: It is malformed (``foreign``), not valid yet (``clock``), ``expired``, of another module
-                (``name``), or ``revoked``.
+            TrustError: There is none, or it is of another CA (``foreign``).
         """
-        if isinstance(certificate, bytes | bytearray):
-            certificates.verify(bytes(certificate), self.files.ca, self.wall(), name=claimed or "", deny=self.deny)
-            return
-        name, begin, expires = member_name(certificate), *_times(certificate)
-        found = ModuleCertificate(name, 0, begin + limits.CERTIFICATE_BACKDATE, expires, b"")
-        found.judge(self.wall(), claimed or "", self.deny)
+        if certificate is None:
+            raise TrustError(TrustReason.FOREIGN, "it has no certificate")
+        return read_certificate(certificate, self.files.ca)
+
+    def judge_member(self, certificate: ModuleCertificate, claimed: str | None) -> None:
+        """Check the certificate of another module; ``claimed`` is the name in its hello, if that is known.
+
+        Raises:
+            TrustError: It is not valid yet (``clock``), ``expired``, of another module (``name``), or ``revoked``.
+        """
+        certificate.judge(self.wall(), claimed or "", self.deny)
 
     def request(self, hosts: Iterable[str] = ()) -> bytes:
         """A request (DER) for a newer certificate of this module and its key, with these hosts of its page."""
@@ -176,21 +181,19 @@ class Membership:
             LimitExceeded: It is too long.
             RemoteProtocolError: It is malformed, or not signed by this mesh's authority.
         """
-        if kind is Document.DENY:
-            deny = read_document(data, self._ca_key, DenyList)
-            if deny.number <= self.deny.number:
-                return False
-            self.deny, self.files = deny, replace(self.files, deny=data)
+        form: type[DenyList | KeyList] = DenyList if kind is Document.DENY else KeyList
+        newer = read_document(data, self._ca_key, form)
+        if newer.number <= self.number(kind):
+            return False
+        if isinstance(newer, DenyList):
+            self.deny, self.files = newer, replace(self.files, deny=data)
             for call in tuple(self.on_denied):  # before a slow disk is written
                 call()
         else:
-            keys = read_document(data, self._ca_key, KeyList)
-            if keys.number <= self.keys.number:
-                return False
-            self.keys, self.files = keys, replace(self.files, keys=data)
-            self.ring.take(keys.keys, self._clock.now(), proves_from=keys.proves_from, age=self._age(keys, 0.0))
+            self.keys, self.files = newer, replace(self.files, keys=data)
+            self.ring.take(newer.keys, self._clock.now(), proves_from=newer.proves_from, age=self._age(newer, 0.0))
         try:
-            self.save(DENY if kind is Document.DENY else KEYS, data)
+            self.store.write(DENY if kind is Document.DENY else KEYS, data)
         except StartError as error:
             _log.error("! %s [%s]", error, error.code)
         return True
@@ -209,7 +212,8 @@ class Membership:
             TrustError: It is of another CA, another module, another key, or not valid now.
             StartError: It cannot be written; the one before goes on.
         """
-        found = certificates.verify(certificate, self.files.ca, self.wall(), name=self.name)
+        found = read_certificate(certificate, self.files.ca)
+        found.judge(self.wall(), self.name)
         if found.public_key != self.certificate.public_key:
             raise TrustError(TrustReason.FOREIGN, "the certificate is of another key")
         self.store.write(CERTIFICATE, ssl.DER_cert_to_PEM_cert(certificate).encode())
@@ -227,32 +231,6 @@ class Membership:
         joins = [ALPN_JOIN] if self.store.is_authority else []
         self.server_context = member_context(*files, ca, ALPN_LINK, *joins, server_side=True)
         self.client_context = member_context(*files, ca, ALPN_LINK, server_side=False)
-
-
-def member_name(certificate: Mapping[str, Any]) -> str:
-    """The module that a certificate is of.
-
-    Args:
-        certificate: As ``SSLObject.getpeercert()`` returns it.
-
-    Raises:
-        TrustError: It is not one of a module.
-    """
-    if not certificate:
-        raise TrustError(TrustReason.FOREIGN, "it has no certificate")
-    uris = [value for kind, value in certificate.get("subjectAltName", ()) if kind == "URI"]
-    if len(uris) != 1 or not uris[0].startswith(certificates.URN):
-        raise TrustError(TrustReason.FOREIGN, "the certificate is not one of a module")
-    return str(uris[0].removeprefix(certificates.URN))
-
-
-def _times(certificate: Mapping[str, Any]) -> tuple[float, float]:
-    """Begin and end of a certificate, seconds since 1970."""
-    try:
-        begin, end = (ssl.cert_time_to_seconds(certificate[key]) for key in ("notBefore", "notAfter"))
-    except (KeyError, ValueError):
-        raise TrustError(TrustReason.FOREIGN, "the certificate has no validity") from None
-    return float(begin), float(end)
 
 
 @contextlib.contextmanager
@@ -298,20 +276,22 @@ class MeshAuthority:
 
     Args:
         membership: This module's, whose store has the CA's key, and which newer documents are given to.
+        is_linked: Whether a member that is linked has a name; by default none is, as no agent runs.
 
     Raises:
         StartError: The CA's key is another one, or a file is broken.
     """
 
-    def __init__(self, membership: Membership) -> None:
+    def __init__(self, membership: Membership, is_linked: Callable[[str], bool] = lambda _: False) -> None:
         self.membership = membership
+        self._is_linked = is_linked
         self._store = store = membership.store
         self._ca_key = private_key(store.load_ca_key(), str(store.path(CA_KEY)))
         if self._ca_key.public_key() != certificates.ca_public_key(membership.files.ca):
             raise unusable(store.path(CA_KEY), "is not the key of ca.crt", "take it from a copy")
         self._issued = store.load_issued()
-        # The tokens.
-        self.book = store.load_tokens()
+        # The tokens, by their ids: each lets one module join once.
+        self.invitations = {each.token_id: each for each in store.load_tokens()}
 
     @property
     def issued(self) -> tuple[Issued, ...]:
@@ -325,28 +305,41 @@ class MeshAuthority:
             address: Where the joining module reaches this one.
             port: The mesh port.
             lifetime: Seconds of its validity.
-            name: The module that it is for; empty for any.
+            name: The module that it is for, whose open tokens it replaces; empty for any.
 
         Raises:
             StartError: The clock is not set, or the file cannot be written.
             ValueError: No module can have that name, or nothing can be reached at the address.
         """
-        secret = os.urandom(limits.TOKEN_SECRET_BYTES)
+        if name and (problem := peer_name_problem(name)):
+            raise ValueError(problem)
+        secret, known = os.urandom(limits.TOKEN_SECRET_BYTES), self.invitations
         token = Token(int(self.wall() + lifetime), address, port, fingerprint_of(self.membership.files.ca), secret)
-        self.book.invite(token, name)
+        self._end_open(name)
+        while len(known) >= limits.TOKENS_MAX:
+            del known[min(known, key=lambda each: (not known[each].used_by, known[each].expires))]
+        known[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)
         self.save_tokens()
         return token
 
+    def _end_open(self, name: str) -> None:
+        """Forget the tokens for a module, not for any, that were not used."""
+        for each in tuple(self.invitations.values()):
+            if name and each.name == name and not each.used_by:
+                del self.invitations[each.token_id]
+
     def withdraw(self, token_id: bytes) -> bool:
         """Make a token that was not used void; return whether there was one."""
-        withdrawn = self.book.withdraw(token_id)
-        if withdrawn:
-            self.save_tokens()
-        return withdrawn
+        invitation = self.invitations.get(token_id)
+        if invitation is None or invitation.used_by:
+            return False
+        del self.invitations[token_id]
+        self.save_tokens()
+        return True
 
     def save_tokens(self) -> None:
         """Write the tokens, one of which was used."""
-        self._store.save_tokens(self.book)
+        self._store.save_tokens(self.invitations.values())
 
     def wall(self) -> float:
         """Seconds since 1970.
@@ -417,38 +410,34 @@ class MeshAuthority:
         Raises:
             TrustError: It is of another CA, ended too long ago, or was revoked.
         """
-        member = self.membership
-        return certificates.verify(
-            certificate, member.files.ca, self.wall(), deny=member.deny, grace=limits.RENEWAL_GRACE
-        )
+        found = self.membership.read_member(certificate)
+        found.judge(self.wall(), deny=self.membership.deny, grace=limits.RENEWAL_GRACE)
+        return found
 
     def renew_own(self, hosts: Iterable[str] = ()) -> None:
         """Renew the certificate of the authority itself, with these hosts of its page; raises as ``issue``."""
         _, certificate = self.issue(self.membership.request(hosts))
         self.membership.renewed(certificate)
 
-    def has_issued(self, name: str, again: str = "") -> bool:
-        """Whether a module of a name has a certificate that has not ended, be it present or not.
+    def is_member(self, name: str, again: str) -> bool:
+        """Whether a module of a name is linked, or has a certificate that has not ended, be it present or not.
 
         Names that differ in case alone would have the same names for browsers.
 
         Args:
             name: The name.
-            again: A module that may join again: its certificate does not count.
+            again: A module that may join again, or empty: its certificate does not count.
         """
         now, folded = self.wall(), name.casefold()
         issued = (each.name for each in self._issued.values() if each.expires > now)
-        return any(each.casefold() == folded and each != again for each in issued)
+        return self._is_linked(name) or any(each.casefold() == folded and each != again for each in issued)
 
-    def join_file(
-        self, request: bytes, again: str = "", is_linked: Callable[[str], bool] = lambda _: False
-    ) -> tuple[CertificateRequest, CertificateGrant]:
+    def join_file(self, request: bytes, again: str = "") -> tuple[CertificateRequest, CertificateGrant]:
         """The answer to a request (DER) in a join by files.
 
         Args:
             request: PKCS #10.
             again: The name of a member that may join again, as of an invitation for it.
-            is_linked: Whether a module that is linked has a name.
 
         Raises:
             ConfigError: Another member has the name.
@@ -456,7 +445,7 @@ class MeshAuthority:
         """
         asked = certificates.read_request(request)
         name = asked.name
-        if is_linked(name) or self.has_issued(name, again):
+        if self.is_member(name, again):
             text = f"a module named {name} is a member"
             remedy = f"if it is that one, and away: --module {name}; else rmpa trust revoke {name}, or another name"
             raise ConfigError("the request", text, remedy)
@@ -501,11 +490,9 @@ class MeshAuthority:
         self._issued.pop(name, None)
         deny = self._publish(deny)
         self.rotate(revoking=True)  # before files are written: a full disk must not leave the old key in use
-        unused = [each for each in self.book.invitations if not each.used_by]
-        for invitation in unused:
-            if invitation.name == name:
-                self.book.withdraw(invitation.token_id)
-        if open_to_all := sum(not each.name and each.expires > self.wall() for each in unused):
+        self._end_open(name)
+        left, wall = self.invitations.values(), self.wall()
+        if open_to_all := sum(not (each.used_by or each.name) and each.expires > wall for each in left):
             _log.warning(
                 "! %d unused tokens are for any name: %s can join again with one of them [member-revoked]",
                 open_to_all,

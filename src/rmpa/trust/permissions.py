@@ -24,7 +24,7 @@ from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from rmpa.config.settings import TrustSettings
 
@@ -131,22 +131,15 @@ class Permissions:
                 self._known.clear()
             known = self._known[module] = {access: [] for access in Access}
             for number, rule in enumerate(self._settings.rules, 1):
-                for access, glob, text in self._globs(number, rule, module):
-                    known[access].append((glob, PermissionDecision(rule.effect is Effect.ALLOW, text, number)))
+                askers, allowed = self._fit(rule, module), rule.effect is Effect.ALLOW
+                verb = f"{number} {'allows' if allowed else 'denies'}"
+                for key, written in _globs(rule) if askers is not None else ():
+                    text = f"[[permission]] {verb} {key} of {written!r} to {askers}"
+                    for access, glob in _accesses(key, written.replace(PEER, module)):
+                        known[access].append((glob, PermissionDecision(allowed, text, number)))
             for found in known.values():
                 found.sort(key=lambda each: each[1].allowed)  # stable: among equals the order of the file stays
         return known
-
-    def _globs(self, number: int, rule: PermissionRule, module: str) -> Iterator[tuple[Access, str, str]]:
-        """The globs of one rule, if it is about a module: the access, the glob, and the rule as text."""
-        askers = self._fit(rule, module)
-        if askers is None:
-            return
-        verb = "allows" if rule.effect is Effect.ALLOW else "denies"
-        for key, written in _globs(rule):
-            text = f"[[permission]] {number} {verb} {key} of {written!r} to {askers}"
-            for access, glob in _accesses(key, written.replace(PEER, module)):
-                yield access, glob, text
 
     def _fit(self, rule: PermissionRule, module: str) -> str | None:
         """Why a rule is about a module, as text; ``None``: it is not."""
@@ -201,12 +194,7 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
     return next((glob for glob in globs if matches(glob, name)), None)
 
 
-# How signed documents reach every module. Which linked peer lacks which document (docs/design/trust.md).
-#
-# Each module tells a new link the numbers of its documents (``trust.have``); the side with a higher number sends
-# that document, deny list first. A module that takes a newer one sends it on to all that are not known to have it. So
-# a document is everywhere after as many trips as the mesh is wide, and in a mesh that was split once it is whole
-# again.
+# How signed documents reach every module: ``agent.trust.AgentTrust`` sends each peer those that it lacks.
 
 
 class Document(StrEnum):
@@ -238,43 +226,6 @@ class Have(msgspec.Struct, frozen=True, omit_defaults=True):
     def numbers(self) -> dict[Document, int]:
         """The numbers by document."""
         return {Document.DENY: self.deny, Document.KEYS: self.keys}
-
-
-class DocumentSpreading:
-    """Knows what each linked peer has.
-
-    Args:
-        number: The number of the document that this module has.
-    """
-
-    def __init__(self, number: Callable[[Document], int]) -> None:
-        self._number = number
-        self._known: dict[int, dict[Document, int]] = {}
-
-    def link_up(self, peer: int) -> None:
-        """A peer is linked; it has not said what it has."""
-        self._known[peer] = {}
-
-    def link_down(self, peer: int) -> None:
-        """A peer is not linked any more."""
-        self._known.pop(peer, None)
-
-    def has(self, peer: int, numbers: Mapping[Document, int]) -> None:
-        """A peer has these documents, as it says or as it sent them."""
-        known = self._known.get(peer, {})
-        known.update({kind: max(number, known.get(kind, 0)) for kind, number in numbers.items()})
-
-    def lacking(self) -> list[tuple[int, Document]]:
-        """Each peer that is known to lack a document, and which; they count as sent."""
-        found = [
-            (peer, kind)
-            for peer, known in self._known.items()
-            for kind in Document
-            if kind in known and known[kind] < self._number(kind)
-        ]
-        for peer, kind in found:
-            self._known[peer][kind] = self._number(kind)
-        return found
 
 
 # The reasons for which a secured mesh refuses a connection. One word each, for wire, counters, commands and logs.

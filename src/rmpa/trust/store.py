@@ -21,7 +21,7 @@ import msgspec
 from rmpa.config.module_name import GATEWAY_SUFFIX, as_owner, module_dir, other_state_dirs
 from rmpa.core.errors import StartError
 from rmpa.trust import limits
-from rmpa.trust.tokens import Invitation, TokenBook
+from rmpa.trust.tokens import Invitation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -75,6 +75,11 @@ class MemberFiles:
 def unusable(what: Path | str, problem: str, remedy: str) -> StartError:
     """The error of a file of trust, or of a module that has none."""
     return StartError(str(what), problem, remedy, code="keys-unusable")
+
+
+def _cannot(done: str, path: Path, error: OSError, remedy: str = "") -> StartError:
+    """The error of a file or folder that cannot be read, written or removed."""
+    return StartError(str(path), f"cannot be {done}: {error.strerror}", remedy, code="directory-unusable")
 
 
 class Issued(msgspec.Struct, frozen=True):
@@ -165,24 +170,23 @@ class TrustStore:
         """The CA's private key (PEM); raises as ``load``."""
         return self._read(CA_KEY, "only a copy brings it back; without one make a new mesh: rmpa trust init")
 
-    def load_tokens(self) -> TokenBook:
+    def load_tokens(self) -> list[Invitation]:
         """The tokens of the authority; none if the file is missing.
 
         Raises:
             StartError: The file cannot be read or is broken.
         """
         if not _is_there(self.path(TOKENS)):
-            return TokenBook()
+            return []
         remedy = "remove it: open tokens are then void"
         try:
-            invitations = msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
+            return msgspec.json.decode(self._read(TOKENS, remedy), type=list[Invitation])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise unusable(self.path(TOKENS), f"is broken: {error!s:.200}", remedy) from None
-        return TokenBook(invitations)
 
-    def save_tokens(self, book: TokenBook) -> None:
+    def save_tokens(self, invitations: Iterable[Invitation]) -> None:
         """Write the tokens of the authority; raises as ``save``."""
-        self.write(TOKENS, msgspec.json.encode(book.invitations))
+        self.write(TOKENS, msgspec.json.encode(list(invitations)))
 
     def load_issued(self) -> dict[str, Issued]:
         """The certificates of the authority, by name; none if the file is missing or broken: renewals fill it."""
@@ -230,9 +234,7 @@ class TrustStore:
                 _write(folder, name, data)
         except OSError as error:
             remedy = _USER if isinstance(error, PermissionError) else "is the disk full?"
-            raise StartError(
-                str(self.path(name)), f"cannot be written: {error.strerror}", remedy, code="directory-unusable"
-            ) from None
+            raise _cannot("written", self.path(name), error, remedy) from None
 
     def remove(self) -> list[str]:
         """Leave the mesh: remove all files; return the names of those that were there.
@@ -248,9 +250,7 @@ class TrustStore:
                 try:
                     (folder / name).unlink()
                 except OSError as error:
-                    raise StartError(
-                        str(self.path(name)), f"cannot be removed: {error.strerror}", code="directory-unusable"
-                    ) from None
+                    raise _cannot("removed", self.path(name), error) from None
             with contextlib.suppress(OSError):
                 folder.rmdir()
         return removed
@@ -270,14 +270,8 @@ class TrustStore:
                 data = b"" if problem else file.read(_FILE_MAX + 1)
         except FileNotFoundError:
             raise unusable(path, "is missing", remedy) from None
-        except PermissionError as error:
-            raise StartError(
-                str(path), f"cannot be read: {error.strerror}", _USER, code="directory-unusable"
-            ) from None
         except OSError as error:
-            raise StartError(
-                str(path), f"cannot be read: {error.strerror}", remedy, code="directory-unusable"
-            ) from None
+            raise _cannot("read", path, error, _USER if isinstance(error, PermissionError) else remedy) from None
         if problem:
             raise unusable(path, problem, f"if the others are trusted: chmod 600 {path}; else {remedy}")
         if not data or len(data) > _FILE_MAX:
@@ -307,7 +301,7 @@ def modules_with_keys(state: Path) -> list[str]:
     try:
         names = _modules_in(state)
     except OSError as error:
-        raise StartError(str(state), f"cannot be read: {error.strerror}", _USER, code="directory-unusable") from None
+        raise _cannot("read", state, error, _USER) from None
     return [name for name in names if TrustStore(state, name).exists]
 
 
@@ -325,11 +319,8 @@ def is_folder(path: Path) -> bool:
         link = next((each for each in (path, *path.parents) if each.is_symlink() and not each.exists()), None)
         if link is None:
             return False
-        path, problem, remedy = (
-            link,
-            f"leads to {link.readlink()}, which is not there",
-            "mount it, or remove the link",
-        )
+        path, remedy = link, "mount it, or remove the link"
+        problem = f"leads to {link.readlink()}, which is not there"
     except NotADirectoryError:
         problem, remedy = "is below a file, not a folder", _ELSEWHERE
     except PermissionError as error:

@@ -26,17 +26,14 @@ import re
 import struct
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
-from rmpa.core.identity import dialable, peer_name_problem
+from rmpa.core.identity import dialable
 from rmpa.core.limits import UINT32_MAX
 from rmpa.trust import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 PREFIX: Final = "rmpa1-"
 FORMAT: Final = 1
@@ -171,96 +168,39 @@ def _checksum(body: bytes) -> bytes:
     return hashlib.sha256(body).digest()[:_CHECKSUM]
 
 
-@dataclass(slots=True)
-class Invitation:
+class Invitation(msgspec.Struct):
     """One token as the authority keeps it.
 
-    Args:
+    Attributes:
         token_id: Its id.
-        key: Its key; empty once it is used or has ended. Not in ``repr``.
+        key: Its key; empty once it is used. Not in ``repr``.
         expires: Seconds since 1970.
         name: The module that it is for; empty for any.
         used_by: The module that joined with it.
     """
 
     token_id: bytes
-    key: bytes = field(repr=False)
+    key: bytes
     expires: int
     name: str = ""
     used_by: str = ""
 
-
-class TokenBook:
-    """The tokens of one authority: each lets one module join once.
-
-    Args:
-        invitations: Those of its file.
-    """
-
-    def __init__(self, invitations: Iterable[Invitation] = ()) -> None:
-        self._all = {invitation.token_id: invitation for invitation in invitations}
-
-    @property
-    def invitations(self) -> tuple[Invitation, ...]:
-        """All that are remembered, for the file and ``rmpa trust status``."""
-        return tuple(self._all.values())
-
-    def invite(self, token: Token, name: str = "") -> None:
-        """Remember a new token.
+    def problem(self, name: str, wall: float) -> str:
+        """Why a module may not join with it, a word of ``TOKEN_PROBLEMS``; empty: it may.
 
         Args:
-            token: The token.
-            name: The module that it is for, whose open tokens it replaces; empty for any.
-
-        Raises:
-            ValueError: No module can have that name.
-        """
-        if name and (problem := peer_name_problem(name)):
-            raise ValueError(problem)
-        if name:
-            open_ones = [key for key, each in self._all.items() if each.name == name and not each.used_by]
-            for key in open_ones:
-                del self._all[key]
-        while len(self._all) >= limits.TOKENS_MAX:
-            del self._all[min(self._all, key=lambda each: (not self._all[each].used_by, self._all[each].expires))]
-        self._all[token.token_id] = Invitation(token.token_id, token.key, token.expires, name)
-
-    def find(self, token_id: bytes) -> Invitation | None:
-        """A token by its id; ``None`` if it is unknown."""
-        return self._all.get(token_id)
-
-    def judge(self, token_id: bytes, name: str, wall: float) -> str:
-        """Why a module may not join with a token, a word of ``TOKEN_PROBLEMS``; empty: it may.
-
-        Args:
-            token_id: The token's.
             name: The module's.
             wall: Seconds since 1970.
         """
-        invitation = self._all.get(token_id)
-        if invitation is None:
-            return "token"
-        if invitation.used_by:
+        if self.used_by:
             return "used"
-        if wall >= invitation.expires:
+        if wall >= self.expires:
             return "late"
-        return "name" if invitation.name not in ("", name) else ""
+        return "name" if self.name not in ("", name) else ""
 
-    def use(self, token_id: bytes, name: str, wall: float) -> str:
-        """Let a module join with a token, which then is used; return why not, as ``judge``."""
-        problem = self.judge(token_id, name, wall)
-        if not problem:
-            invitation = self._all[token_id]
-            invitation.used_by, invitation.key = name, b""
-        return problem
-
-    def withdraw(self, token_id: bytes) -> bool:
-        """Forget a token that was not used; return whether there was one."""
-        invitation = self._all.get(token_id)
-        if invitation is None or invitation.used_by:
-            return False
-        del self._all[token_id]
-        return True
+    def __repr__(self) -> str:
+        """Without the key."""
+        return f"Invitation({self.token_id.hex()})"
 
 
 # The messages of joins and renewals. One question and one answer, inside TLS with the ALPN ``rmpa-join/1``.

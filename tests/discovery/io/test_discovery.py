@@ -58,10 +58,10 @@ class Agent:
         )
 
     def names(self) -> set[str]:
-        return {view.run.identity.name for view in self.discovery.peers() if view.present}
+        return {view.run.identity.name for view in self.discovery.membership.endpoints.views() if view.present}
 
     def view(self, name: str) -> PeerView:
-        return next(v for v in self.discovery.peers() if v.run.identity.name == name)
+        return next(v for v in self.discovery.membership.endpoints.views() if v.run.identity.name == name)
 
     async def end(self) -> None:
         await self.discovery.close()
@@ -281,7 +281,7 @@ async def test_events_may_call_back(agents: list[Agent], settings: Settings) -> 
         if event.change == "found":
             base.discovery.link_up(event.identity)
 
-    base.discovery._on_event = link
+    base.discovery.on_event = link
     await start(agents, base, pc)
     await until(lambda: base.names() and base.view("pc").run.linked)
 
@@ -384,12 +384,12 @@ async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list
 
     base = Agent("base", settings, look=lambda: tuple(now_there), on_interfaces=fits)
     await start(agents, base)
-    await until(lambda: not base.discovery._membership._burst)
+    await until(lambda: not base.discovery.membership._burst)
     for times in (1, 2):
         now_there.append(Interface(f"new{times}", index=4242 + times, up=False))
         base.discovery._look_again()
         assert len(asked) == times
-        assert bool(base.discovery._membership._burst) == (times == 2)
+        assert bool(base.discovery.membership._burst) == (times == 2)
 
 
 async def test_seeds_that_do_not_answer_and_another_domain_are_told(

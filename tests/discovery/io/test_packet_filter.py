@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.statistics import Counters
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.beacon import STRANGER_KEPT, Beacon, BeaconKind, PacketFilter
 from rmpa.discovery.discovery import BEACONS_UNPROVED_PAUSE
-from rmpa.discovery.packet_filter import STRANGER_KEPT, PacketFilter
 from rmpa.trust import limits as trust_limits
 from rmpa.trust.packets import GroupKey, KeyRing, PacketTrust
 from rmpa.trust.permissions import TrustReason

@@ -52,7 +52,7 @@ class Member(Membership):
         store.folder.mkdir(parents=True)
         store.path(CERTIFICATE).write_text(ssl.DER_cert_to_PEM_cert(certificate))
         store.path(KEY).write_bytes(files.key)
-        super().__init__(store, files, SystemClock(), time.time)
+        super().__init__(store, files, SystemClock())
 
     def revoke(self, name: str) -> None:
         """Let a newer deny list hold here."""

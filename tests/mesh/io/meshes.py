@@ -137,7 +137,7 @@ class Peer:
     def kill(self) -> None:
         """As kill -9: the kernel closes the sockets, and no bye is sent."""
         self.mesh._running = False
-        self.mesh._acceptor.close()
+        self.mesh.acceptor.close()
         self.mesh._timer.close()
         for connection in self.mesh.connections():
             connection.lost("killed")

@@ -23,7 +23,7 @@ from rmpa.core.limits import KIB, MIB
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FrameKind, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import (
+from rmpa.mesh.io.lane import (
     BULK_WINDOW_MAX,
     BULK_WINDOW_MIN,
     DIAL_ATTEMPTS,
@@ -203,7 +203,7 @@ async def test_status_of_an_unreachable_peer_says_why() -> None:
             ghost = Identity(Guid.of("127.255.255.254", port), b"g" * 16, "ghost")
         one.mesh.peer_found(ghost)
         await until(lambda: one.mesh.counters["link.dial_failed"] >= 2, "two attempts")
-        (status,) = one.mesh.peers()
+        (status,) = one.mesh.peering.peers()
         assert status.state in ("waiting", "dialling")
         assert "refused" in status.last_error.lower()
 
@@ -318,7 +318,7 @@ async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
         links = [*references(one, other), *references(other, one)]
         for _ in range(20):
             one.link(other).bulk.send(1, 1, 0, bytes(MB))
-        assert one.link(other).queue_bytes
+        assert one.link(other).info().queued
         if way == "end":
             await other.mesh.close()
         else:

@@ -13,8 +13,7 @@ import pytest
 from rmpa.config.settings import LaneSettings
 from rmpa.core.identity import Guid, Identity
 from rmpa.mesh.frames import Frame, FrameKind, Lane, pack_data_header
-from rmpa.mesh.io.dial import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED
-from rmpa.mesh.io.lane import LaneSender
+from rmpa.mesh.io.lane import BULK_UNSENT_BYTES, EXPRESS_UNSENT_BYTES, LINK_UNACKED, LaneSender
 from rmpa.mesh.io.link import Connection, PeerLink
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 
@@ -109,7 +108,7 @@ async def test_small_messages_go_on_while_the_bulk_lane_is_gone(by_dialler: bool
         await until(lambda: bool(one.data and other.data), "before the cut")
         victim = one.link(other) if by_dialler else other.link(one)
         before = [one.link(other), other.link(one)]
-        bytes_before = [(link.bytes_in, link.bytes_out) for link in before]
+        infos = [link.info() for link in before]
         bulk_of(victim).sock.shutdown(socket.SHUT_RDWR)
         await until(lambda: bool(one.lanes_lost and other.lanes_lost), "both know")
         for sender, receiver in ((one, other), (other, one)):
@@ -131,9 +130,9 @@ async def test_small_messages_go_on_while_the_bulk_lane_is_gone(by_dialler: bool
             assert len(peer.ups) == len(peer.lanes_lost) == 1
             assert peer.mesh.counters["link.bulk_lost"] == 1
         assert [one.link(other), other.link(one)] == before
-        for link, (was_in, was_out) in zip(before, bytes_before, strict=True):
-            assert link.bytes_in >= was_in + 300_000, "the counts of the connection before are kept"
-            assert link.bytes_out >= was_out + 300_000
+        for now, was in zip([link.info() for link in before], infos, strict=True):
+            assert now.bytes_in >= was.bytes_in + 300_000, "the counts of the connection before are kept"
+            assert now.bytes_out >= was.bytes_out + 300_000
 
 
 async def test_rest_of_a_torn_message_is_not_sent() -> None:
@@ -218,11 +217,11 @@ async def test_fence_on_an_unused_link_is_not_answered() -> None:
         sock, _ = await raw(one, HAND_MADE, lease=60.0)
         await until(lambda: bool(one.ups), "a link")
         one.ups[0].use(used=False)
-        before = one.ups[0].bytes_in
+        before = one.ups[0].info().bytes_in
         loop = asyncio.get_running_loop()
         data = pack_data_header(3, 7, 1, 0) + b"not"
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=1).serialize())
-        await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
+        await until(lambda: one.ups[0].info().bytes_in >= before + 2 * 24 + 3, "read")
         one.ups[0].use(used=True)
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=2).serialize())
         kept = b""

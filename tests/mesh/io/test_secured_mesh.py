@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import socket
 import ssl
 from dataclasses import replace
@@ -18,13 +17,9 @@ pytest.importorskip("cryptography")
 
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.limits import MIB
-from rmpa.core.log import RefusalLog
-from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, Lane, Refusal, Refuse
 from rmpa.mesh.io.link import PeerLink
-from rmpa.mesh.io.securing import Securing
-from rmpa.runtime.loop import SystemClock
 from rmpa.runtime.tls import TlsHandshake
 from rmpa.trust.permissions import TrustReason
 from rmpa.trust.store import ALPN_LINK, join_context
@@ -44,8 +39,8 @@ def _has_all(peer: Peer) -> bool:
     return len(peer.data) == 2 and bool(peer.controls)
 
 
-def status(at: Peer, of: Peer) -> KnownPeer:
-    return next(s for s in at.mesh.peers() if s.identity.guid == of.identity.guid)
+def status(at: Peer, of: Peer) -> KnownPeer[PeerLink]:
+    return next(s for s in at.mesh.peering.peers() if s.identity.guid == of.identity.guid)
 
 
 async def test_members_link_by_both_lanes_and_messages_cross(lab: Authority) -> None:
@@ -98,11 +93,11 @@ async def test_a_dialler_learns_why_its_certificate_is_refused(lab: Authority, b
     async with meshes(mine, judge, found=False) as (low, high):
         low.mesh.peer_found(high.identity)
         for _ in range(3):
-            await until(lambda: bool(low.mesh.peers()[0].last_error), "refused")
+            await until(lambda: bool(low.mesh.peering.peers()[0].last_error), "refused")
             assert status(low, high).last_error.startswith(f"{bad}:")
             assert status(low, high).state == "refused"
             low.mesh.peer_gone(high.identity.guid)
-            await until(lambda: not low.mesh.peers(), "forgotten")
+            await until(lambda: not low.mesh.peering.peers(), "forgotten")
             low.mesh.peer_found(high.identity)
 
 
@@ -143,10 +138,10 @@ async def test_a_refusal_without_proof_is_shown_and_sets_no_pause(
         guid = Guid.of("127.0.0.1", server.sockets[0].getsockname()[1], 0)
         arm.mesh.peer_found(Identity(guid, b"i" * 16, "base"))
         await until(lambda: dials >= 3, "dialled again")
-        await until(lambda: arm.mesh.peers()[0].state == "refused", "shown")
+        await until(lambda: arm.mesh.peering.peers()[0].state == "refused", "shown")
         shown = "unsecured" if answer == TrustReason.UNSECURED else "downgrade"
-        assert arm.mesh.peers()[0].last_error.startswith(shown)
-        assert (answer is None) != ("go away" in arm.mesh.peers()[0].last_error)
+        assert arm.mesh.peering.peers()[0].last_error.startswith(shown)
+        assert (answer is None) != ("go away" in arm.mesh.peering.peers()[0].last_error)
 
 
 async def test_another_modules_run_cannot_be_taken_over(lab: Authority) -> None:
@@ -189,7 +184,7 @@ async def test_a_bulk_lane_joins_the_link_of_its_own_module_only(
     async with meshes(Member(lab, "arm"), Member(lab, "base")) as (arm, base):
         await until(lambda: arm.both_lanes(base) and base.both_lanes(arm), "both lanes")
         lane = base.link(arm).bulk_connection
-        monkeypatch.setattr(base.mesh, "_prove", lambda *_: None)
+        monkeypatch.setattr(base.mesh._securing, "prove", lambda *_: None)
         thief = Peer(arm.number, name="thief", security=Member(lab, "thief"))
         try:
             await thief.mesh.start()
@@ -277,24 +272,17 @@ async def test_a_handshake_that_stands_still_or_is_none_is_given_up(
 
 
 async def test_a_handshake_that_has_not_begun_leaves_no_socket_when_the_mesh_ends(lab: Authority) -> None:
-    member = Member(lab, "arm")
     ours, theirs = socket.socketpair()
-    with ours, theirs:
-        ours.setblocking(False)
-        securing = Securing(
-            member,
-            clock=SystemClock(),
-            refusals=RefusalLog(logging.getLogger(__name__), Counters()),
-            on_secured=lambda *_: None,
-            on_refused=lambda *_: None,
-            on_join=None,
-            pause=lambda _: None,
-        )
-        securing.accept(ours, ("127.0.0.1", 1))
-        (task,) = securing._unproven
-        await securing.close()
-        assert task.cancelled()
-        assert ours.fileno() == -1
+    async with meshes(Member(lab, "arm")) as (arm,):
+        with ours, theirs:
+            ours.setblocking(False)
+            securing = arm.mesh._securing
+            assert securing is not None
+            securing.accept(ours, ("127.0.0.1", 1))
+            (task,) = securing._unproven
+            await arm.mesh.close()
+            assert task.cancelled()
+            assert ours.fileno() == -1
 
 
 async def test_one_certificate_has_a_bounded_number_of_connections(

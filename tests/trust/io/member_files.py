@@ -35,9 +35,6 @@ class HandClock(SystemClock):
     def wall_ns(self) -> int:
         return int(self.wall_seconds * 1e9)
 
-    def wall(self) -> float:
-        return self.wall_seconds
-
 
 def pem_of(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(
@@ -71,4 +68,4 @@ class SecuredMesh:
         return store
 
     def member(self, name: str, wall: float = WALL) -> Membership:
-        return Membership.load(self.save(name, wall), self.clock, self.clock.wall)
+        return Membership.load(self.save(name, wall), self.clock)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -33,20 +33,24 @@ def mesh(tmp_path: Path) -> SecuredMesh:
     return SecuredMesh(tmp_path)
 
 
-def reason_of(member: Membership, certificate: dict[str, Any] | bytes, claimed: str | None) -> TrustReason:
+def judge(member: Membership, certificate: bytes | None, claimed: str | None) -> None:
+    member.judge_member(member.read_member(certificate), claimed)
+
+
+def reason_of(member: Membership, certificate: bytes | None, claimed: str | None) -> TrustReason:
     with pytest.raises(TrustError) as caught:
-        member.judge_member(certificate, claimed)
+        judge(member, certificate, claimed)
     return caught.value.reason
 
 
-def test_certificates_are_judged_in_both_forms(mesh: SecuredMesh, tmp_path: Path) -> None:
+def test_certificates_of_others_are_judged(mesh: SecuredMesh, tmp_path: Path) -> None:
     base = mesh.member("base")
     certificate = mesh.authority.module("arm")
-    base.judge_member(certificate, "arm")
-    base.judge_member(certificate, None)
+    judge(base, certificate, "arm")
+    judge(base, certificate, None)
     assert reason_of(base, certificate, "joystick") is TrustReason.NAME
     assert reason_of(base, SecuredMesh(tmp_path).authority.module("arm"), "arm") is TrustReason.FOREIGN
-    assert reason_of(base, {"notBefore": "x"}, None) is reason_of(base, {}, None) is TrustReason.FOREIGN
+    assert reason_of(base, b"nonsense", None) is reason_of(base, None, None) is TrustReason.FOREIGN
     mesh.clock.wall_seconds = WALL + 8 * DAY
     assert reason_of(base, certificate, "arm") is TrustReason.EXPIRED
     late = mesh.authority.module("arm", WALL + 9 * DAY)
@@ -58,7 +62,7 @@ def test_a_clock_is_set_if_it_is_behind_the_begin_of_the_own_certificate(mesh: S
     begin = WALL - limits.CERTIFICATE_BACKDATE
     mesh.clock.wall_seconds = begin - 1
     assert base.wall() is None
-    base.judge_member(mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
+    judge(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm")  # its time cannot be judged
     mesh.clock.wall_seconds = begin + 1
     assert base.wall() == begin + 1
     assert reason_of(base, mesh.authority.module("arm", WALL - 30 * DAY), "arm") is TrustReason.EXPIRED
@@ -75,8 +79,8 @@ def test_a_newer_deny_list_holds_at_once_and_after_a_restart(mesh: SecuredMesh) 
     assert called == [1]
     assert base.document(Document.DENY) == newer
     assert reason_of(base, certificate, "arm") is TrustReason.REVOKED
-    base.judge_member(mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
-    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+    judge(base, mesh.authority.module("arm", WALL + 60), "arm")  # it was invited again
+    again = Membership.load(base.store, mesh.clock)
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED
     mesh.clock.wall_seconds = 0.0
     assert reason_of(again, certificate, "arm") is TrustReason.REVOKED, "a clock that is set back lets none in again"
@@ -106,7 +110,7 @@ def test_a_new_group_key_is_taken_without_a_pause(mesh: SecuredMesh) -> None:
     assert heard_by_arm() is Verdict.UNKNOWN_KEY
     assert arm.accept_document(Document.KEYS, data)
     assert heard_by_arm() is Verdict.ACCEPTED
-    assert Membership.load(arm.store, mesh.clock, mesh.clock.wall).ring.newest.number == 2
+    assert Membership.load(arm.store, mesh.clock).ring.newest.number == 2
 
 
 def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: SecuredMesh) -> None:
@@ -116,7 +120,7 @@ def test_a_member_that_restarts_during_a_rotation_goes_on_as_the_others(mesh: Se
     assert base.accept_document(Document.KEYS, sign(rotated, mesh.authority.key))
     mesh.clock.seconds += 10
     mesh.clock.wall_seconds = WALL + 10
-    again = Membership.load(base.store, mesh.clock, mesh.clock.wall)
+    again = Membership.load(base.store, mesh.clock)
 
     def heard(sender: Membership, receiver: Membership) -> Verdict:
         now = mesh.clock.now()
@@ -135,7 +139,7 @@ def test_after_a_revocation_the_key_before_recognises_alone_also_after_a_restart
     for number, made in enumerate((keys, [*keys, GroupKey(3, b"o" * 32)]), 2):  # a rotation of the usual kind follows
         listed = KeyList(number, tuple(made), proves_from=2, made=int(WALL))
         assert base.accept_document(Document.KEYS, sign(listed, mesh.authority.key))
-        for member in (base, Membership.load(base.store, mesh.clock, mesh.clock.wall)):
+        for member in (base, Membership.load(base.store, mesh.clock)):
             now = mesh.clock.now()
             packet = revoked.packets.sign(PACKET, now)
             heard = member.packets.verify(packet, (0, 8), now)
@@ -154,7 +158,7 @@ def test_a_renewed_certificate_is_used_and_kept(mesh: SecuredMesh) -> None:
     base.renewed(newer)
     assert base.certificate.expires == WALL + 11 * DAY
     assert base.server_context is not before
-    assert Membership.load(base.store, mesh.clock, mesh.clock.wall).certificate.serial == 77
+    assert Membership.load(base.store, mesh.clock).certificate.serial == 77
     with pytest.raises(TrustError, match="of another key"):
         base.renewed(mesh.authority.module("base", WALL + 4 * DAY))
     with pytest.raises(TrustError, match="of arm, not of base"):
@@ -173,14 +177,14 @@ def test_broken_files_are_named(mesh: SecuredMesh, name: str, content: bytes, wo
     store = mesh.save("base")
     store.write(name, content)
     with pytest.raises(StartError, match=words):
-        Membership.load(store, mesh.clock, mesh.clock.wall)
+        Membership.load(store, mesh.clock)
 
 
 def test_files_of_two_meshes_do_not_fit(mesh: SecuredMesh, tmp_path: Path) -> None:
     store, other = mesh.save("base"), SecuredMesh(tmp_path / "other").save("base")
     store.write(files_of.CA, other.path(files_of.CA).read_bytes())
     with pytest.raises(StartError, match=r"module\.crt: is broken: the certificate is of another CA"):
-        Membership.load(store, mesh.clock, mesh.clock.wall)
+        Membership.load(store, mesh.clock)
 
 
 def test_no_secret_is_in_a_repr(mesh: SecuredMesh) -> None:
@@ -204,12 +208,6 @@ def shake(dialler: Membership, acceptor: Membership) -> tuple[ssl.SSLObject, ssl
     return client.tls, server.tls
 
 
-def seen_by(tls: ssl.SSLObject) -> dict[str, Any]:
-    found = tls.getpeercert()
-    assert found
-    return dict(found)
-
-
 def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None:
     arm, base = mesh.member("arm"), mesh.member("base")
     # OpenSSL judges times by this machine's clock; the test's certificates are of another year.
@@ -218,6 +216,6 @@ def test_two_members_link_and_know_each_other_by_name(mesh: SecuredMesh) -> None
     mesh.clock.wall_seconds = WALL
     assert at_arm.version() == "TLSv1.3"
     assert at_arm.selected_alpn_protocol() == at_base.selected_alpn_protocol() == "rmpa/1"
-    arm.judge_member(seen_by(at_arm), "base")
-    base.judge_member(seen_by(at_base), "arm")
-    assert reason_of(base, seen_by(at_base), "joystick") is TrustReason.NAME
+    judge(arm, at_arm.getpeercert(binary_form=True), "base")
+    judge(base, at_base.getpeercert(binary_form=True), "arm")
+    assert reason_of(base, at_base.getpeercert(binary_form=True), "joystick") is TrustReason.NAME

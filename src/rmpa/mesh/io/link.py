@@ -16,10 +16,8 @@ from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits
 from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
-from rmpa.mesh.frames import Frame, FrameKind, Lane
-from rmpa.mesh.io.dial import bound_queue
-from rmpa.mesh.io.lane import LaneSender
-from rmpa.mesh.io.securing import tls_failure
+from rmpa.mesh.frames import Frame, FrameKind, Lane, Link
+from rmpa.mesh.io.lane import LaneSender, bound_queue
 from rmpa.mesh.peering import REPLACED, RESTARTED
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
@@ -32,8 +30,9 @@ if TYPE_CHECKING:
     from rmpa.mesh.connection import DataHandler
     from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.io.securing import SecuredSocket
     from rmpa.mesh.peering import SocketAddress
+    from rmpa.runtime.tls import SecureSocket
+    from rmpa.trust.certificates import ModuleCertificate
 
 # Bytes of control frames that may wait for one link: two of the longest. They are never dropped, so beyond this the
 # link is closed.
@@ -83,11 +82,9 @@ class Connection(ConnectionProtocol):
     """One TCP connection: its machine, driven by one stream and one timer.
 
     Args:
-        connection_id: The mesh's number for it.
         mesh: The mesh, which decides on its handshake.
         sock: Connected, non-blocking; owned by the connection from here on.
         endpoint: Address and port of the remote side.
-        dialled: Whether this side dialled.
         expected: The GUID that was dialled; ``None`` on an accepted connection.
         lane: What this side dials for; on an accepted connection the remote side's hello says it.
         secured: What encrypts ``sock``, and the remote side's certificate; ``None`` in a mesh without trust.
@@ -103,17 +100,14 @@ class Connection(ConnectionProtocol):
 
     def __init__(
         self,
-        connection_id: int,
         mesh: Mesh,
         sock: socket.socket,
         endpoint: SocketAddress,
         *,
-        dialled: bool,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
-        secured: SecuredSocket | None = None,
+        secured: tuple[SecureSocket, ModuleCertificate] | None = None,
     ) -> None:
-        self.id = connection_id
         self.mesh = mesh
         self.sock = sock
         self.remote_endpoint = endpoint
@@ -134,7 +128,7 @@ class Connection(ConnectionProtocol):
         super().__init__(
             mesh.identity,
             mesh.clock.now(),
-            dialled=dialled,
+            dialled=expected is not None,
             wall_ns=mesh.clock.wall_ns,
             expected=expected,
             lane=lane,
@@ -143,7 +137,7 @@ class Connection(ConnectionProtocol):
             counters=mesh.counters,
             pace=mesh.pace,
         )
-        self._timer = MachineTimer(self.next_timer, self._due, now=mesh.clock.now)
+        self._timer = MachineTimer(self.next_timer, self._due)
         self.flush()
 
     @property
@@ -277,8 +271,7 @@ class Connection(ConnectionProtocol):
         self.crashed = self.up and (error is None or number in _ENDED_THERE)
         if isinstance(error, ssl.SSLError) and self.state is ConnectionState.HANDSHAKING:
             # In TLS 1.3 the acceptor judges the dialler's certificate when the dialler is already done.
-            failure = tls_failure(error)
-            self.refused(failure.refuse, by_us=failure.by_us)
+            self.mesh.tls_failed(self, error)
         self.lost(
             f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         )
@@ -299,11 +292,11 @@ class Connection(ConnectionProtocol):
         self.silent = was_up and self.state is ConnectionState.CLOSED
         link = self._express_of()
         if self.up and link is not None and self.dialled and not link.alive:
-            self.mesh.redial(link)
+            self.mesh.link_silent(link)
         self.flush()
 
 
-class PeerLink:
+class PeerLink(Link):
     """The link to one peer, as the rooms above see it; it lives as long as the connection of its express lane.
 
     The connection of the bulk lane may be missing, fall or be replaced meanwhile; messages for that lane wait. It has
@@ -318,7 +311,7 @@ class PeerLink:
         bulk_connection: The connection of the bulk lane, while there is one.
         bulk_wanted: Whether a message of either side has wanted the bulk lane.
         backoff: The pauses between dials of the bulk lane.
-        redial: The task that dials the bulk lane, and the one that dials the silent peer anew, if there is one.
+        bulk_dial: The task that dials the bulk lane.
         used: Whether this link carries the peer's data; of two links with one peer, only one is used.
         over: Why it is no longer used; see ``LinkHandlers.down``.
         routes: The handlers of the data that arrives, by route; both lanes look here while the link is used.
@@ -331,13 +324,10 @@ class PeerLink:
     """
 
     def __init__(self, connection: Connection, mesh: Mesh) -> None:
-        self.id: Final = connection.id
-        self.identity: Final = connection.identity
+        super().__init__(connection.identity, connection.remote_endpoint, dialled=connection.dialled)
         self.guid: Final = connection.identity.guid
         self.name: Final = connection.identity.name
-        self.remote_endpoint: Final = connection.remote_endpoint
         self.local_address: Final[str] = connection.sock.getsockname()[0]
-        self.dialled: Final = connection.dialled
         self.since: Final = connection.since
         self.connection: Final = connection
         self.bulk_connection: Connection | None = None
@@ -346,7 +336,6 @@ class PeerLink:
         self.bulk_wanted = False
         self.backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, mesh.rng)
         self.bulk_dial: asyncio.Task[None] | None = None
-        self.redial: asyncio.Task[None] | None = None
         self.used = False
         self.routes: dict[int, DataHandler] = {}
         self.over = ""
@@ -387,9 +376,10 @@ class PeerLink:
         """Whether bytes were received lately, at the pace of the link."""
         return self._mesh.clock.now() - self.heard_at < self.connection.keepalive.quiet_after
 
-    def is_silent(self) -> bool:
-        """Whether the link is used, and nothing comes."""
-        return self.used and not self.alive
+    @property
+    def stuck(self) -> bool:
+        """Whether it is silent, and the peer has not acknowledged what was sent."""
+        return not self.alive and self.connection.stream.unacknowledged > 0
 
     @property
     def clock_offset(self) -> float | None:
@@ -420,21 +410,6 @@ class PeerLink:
         return self.connection.stream.resumed_at
 
     @property
-    def bytes_in(self) -> int:
-        """Bytes received, headers included, by both lanes."""
-        return self._bulk_in + sum(connection.stream.bytes_in for connection in self._connections())
-
-    @property
-    def bytes_out(self) -> int:
-        """Bytes that the kernel took, headers included, on both lanes."""
-        return self._bulk_out + sum(connection.stream.bytes_out for connection in self._connections())
-
-    @property
-    def queue_bytes(self) -> int:
-        """Bytes that the kernel has not taken yet, on both lanes."""
-        return self.connection.stream.pending_bytes + self.bulk.outbox.pending_bytes
-
-    @property
     def busy(self) -> bool:
         """Whether the express lane has a backlog, so that a further advertisement would delay later commands."""
         stream = self.connection.stream
@@ -461,9 +436,9 @@ class PeerLink:
             rtt=self.connection.clock.rtt,
             clock_offset=self.clock_offset,
             clock_error=self.clock_error,
-            bytes_in=self.bytes_in,
-            bytes_out=self.bytes_out,
-            queued=self.queue_bytes,
+            bytes_in=self._bulk_in + sum(lane.bytes_in for lane in lanes),
+            bytes_out=self._bulk_out + sum(lane.bytes_out for lane in lanes),
+            queued=sum(lane.queued for lane in lanes),
             dropped=sum(lane.dropped for lane in lanes),
             heard_ago=now - self.heard_at,
             rests=self.rests,

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 import random
-from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
@@ -15,11 +14,11 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
 from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
-from rmpa.mesh.io.dial import Dialler
+from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
-from rmpa.mesh.io.securing import Securing, SecuringError, prove, secure_dialled
-from rmpa.mesh.keepalive import Pace, rest_lease
-from rmpa.mesh.peering import REPLACED, Peer, Peering, PeeringOutput
+from rmpa.mesh.io.securing import Securing, SecuringError, tls_failure
+from rmpa.mesh.keepalive import Pace
+from rmpa.mesh.peering import REPLACED, Peering, PeeringOutput
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -28,6 +27,7 @@ from rmpa.trust.permissions import TrustReason
 
 if TYPE_CHECKING:
     import socket
+    import ssl
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
@@ -61,7 +61,6 @@ class Mesh:
         listen_socket: Bound and listening, non-blocking; owned by the mesh from here on.
         handlers: What is called when something happens to a link.
         lanes: The options of the lanes' sockets.
-        clock: The time; its ``now`` must be the loop's own clock.
         rng: Uniform numbers in [0, 1), for jitter.
         dialler: Opens the connections; by default real ones.
         security: This module's membership of a secured mesh: all links use TLS then; ``None``: none does.
@@ -70,6 +69,7 @@ class Mesh:
     Attributes:
         counters: Where refusals and failures are counted.
         pace: What the keepalives of all links have in common.
+        peering: All known peers: linked, or why not and when the next attempt is due.
     """
 
     def __init__(
@@ -79,45 +79,29 @@ class Mesh:
         handlers: LinkHandlers,
         *,
         lanes: LaneSettings | None = None,
-        clock: SystemClock | None = None,
         rng: Callable[[], float] = random.random,
         dialler: Dialler | None = None,
         security: Membership | None = None,
         on_join: OnJoin | None = None,
     ) -> None:
         self.identity, self.handlers, self.rng = identity, handlers, rng
-        self.clock, self.counters, self.pace = clock or SystemClock(), Counters(), Pace.of(identity)
-        self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
-        self._refusals = RefusalLog(_log, self.counters)
+        self.clock, self.counters, self.pace = SystemClock(), Counters(), Pace.of(identity)
+        self.acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
+        self.refusals = RefusalLog(_log, self.counters)
         self.dialler: Final = dialler or Dialler(lanes or LaneSettings(), self.counters)
-        self._peering = Peering(identity, rng=rng, alive=lambda link_id: self._links[link_id].alive)
-        self._timer = MachineTimer(self._peering.next_timer, self._due, now=self.clock.now)
-        self._connections: dict[int, Connection] = {}
-        # The links, by the id of the express lane's connection.
-        self._links: dict[int, PeerLink] = {}
+        self.peering: Peering[PeerLink] = Peering(identity, rng=rng)
+        self._timer = MachineTimer(self.peering.next_timer, self._due)
+        self._connections: list[Connection] = []
         # The dials that are under way.
         self._tasks = OwnedTasks()
-        self._security = security
-        self._securing: Securing | None = None
-        if security is not None:
-            self._securing = Securing(
-                security,
-                clock=self.clock,
-                refusals=self._refusals,
-                on_secured=self._secured,
-                on_refused=self._peering.refused_from,
-                on_join=on_join,
-                pause=self._acceptor.pause,
-            )
-            security.on_denied.append(self._denied)
-        self._ids = count(1)
+        self._securing = None if security is None else Securing(self, security, on_join)
         self._acting = False
         self._running = False
 
     async def start(self) -> None:
         """Begin to accept and to dial; peers may have been found before."""
         self._running = True
-        self._acceptor.start()
+        self.acceptor.start()
         self._act()
 
     async def close(self, *, moves: bool = False) -> None:
@@ -127,13 +111,11 @@ class Mesh:
             moves: Whether this agent is back at once, at another address: the address of some connections may be gone
                 already, so that their byes have no answer, and are not waited for.
         """
-        self._acceptor.close()
+        self.acceptor.close()
         if not self._running:
             return
         self._running = False
         self._timer.close()
-        if self._security is not None:
-            self._security.on_denied.remove(self._denied)
         if self._securing is not None:
             await self._securing.close()
         await self._tasks.close()
@@ -152,33 +134,26 @@ class Mesh:
             identity: The peer; its addresses are dialled in turn.
             source: The source address of the peer's own beacon, which is dialled first.
         """
-        self._peering.peer_found(identity, self.clock.now(), source)
+        self.peering.peer_found(identity, self.clock.now(), source)
         self._act()
 
     def peer_gone(self, guid: Guid) -> None:
         """Stop dialling a peer that discovery has given up; a link that is up stays."""
-        self._peering.peer_gone(guid)
+        self.peering.peer_gone(guid)
         self._act()
 
     def notes(self) -> tuple[str, ...]:
         """Problems of this module in the mesh, as texts for the user."""
-        return (FULL.text,) if self._peering.left_out else ()
-
-    def count_peers(self, peers: int) -> None:
-        """Take the number of peers that are present: it decides how rare the keepalives of links at rest are."""
-        self.pace.rest_lease = rest_lease(peers)
-
-    def peers(self) -> list[Peer]:
-        """All known peers: linked, or why not and when the next attempt is due."""
-        return self._peering.peers()
+        return (FULL.text,) if self.peering.left_out else ()
 
     def connections(self) -> list[Connection]:
         """All connections, those without a handshake too."""
-        return list(self._connections.values())
+        return list(self._connections)
 
     def links(self) -> list[PeerLink]:
         """The links that are used, one a peer."""
-        return [link for link in self._links.values() if link.used]
+        links = ((each, each.link) for each in self._connections)
+        return [link for each, link in links if link is not None and link.used and link.connection is each]
 
     def link(self, guid: Guid) -> PeerLink | None:
         """The link that is used with this peer."""
@@ -186,10 +161,10 @@ class Mesh:
 
     def judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello or welcome of the remote side; the peering machine knows the links that are up."""
-        refuse = self._prove(connection, hello)
+        refuse = None if self._securing is None else self._securing.prove(connection, hello)
         if refuse is not None or connection.dialled:
             return refuse
-        refuse = self._peering.judge(hello, self.clock.now())
+        refuse = self.peering.judge(hello, self.clock.now())
         if refuse is not None and refuse.code == Refusal.DUPLICATE:
             for link in self.links():
                 if link.guid.place == hello.guid.place and link.rests:
@@ -198,22 +173,11 @@ class Mesh:
                     return Refuse(Refusal.ALREADY_LINKED, "the link of your former run is being checked; dial again")
         return refuse
 
-    def _prove(self, connection: Connection, hello: Hello) -> Refuse | None:
-        """Compare a hello with the certificate, and with the names of the links that it would replace or join."""
-        if self._security is None or connection.certificate is None:
-            return None
-        linked = [(link.identity, link.alive) for link in self.links()]
-        others = (each.remote for each in self.connections() if each.up and each is not connection)
-        named = sum(other is not None and other.name == hello.name for other in others)
-        return prove(hello, connection.certificate, self._security, linked, named)
-
     def opened(self, connection: Connection) -> None:
         """Make a link of a connection whose handshake succeeded, or the bulk lane of one."""
         connection.expected = None
         if connection.lane != Lane.BULK:
-            link = self._links[connection.id] = PeerLink(connection, self)
-            now, endpoint = self.clock.now(), link.remote_endpoint
-            self._peering.link_up(link.id, link.identity, now, dialled=link.dialled, endpoint=endpoint)
+            self.peering.link_up(PeerLink(connection, self), self.clock.now())
             self._act()
             return
         there = (link for link in self.links() if link.guid.place == connection.identity.guid.place)
@@ -231,7 +195,7 @@ class Mesh:
         ordinary, kind = refuse.code in _ORDINARY, f"link.refused.{refuse.label}"
         if by_us and not ordinary:
             text = f"refused a link with {connection.name} at {address}: {refuse.text}"
-            self._refusals.refuse(now, kind, address, text)
+            self.refusals.refuse(now, kind, address, text)
         elif ordinary or refuse.code in _TRUST:
             self.counters.add(kind)
             _log.debug("! %s: %s", connection.name, refuse)
@@ -239,27 +203,32 @@ class Mesh:
             self._distrusted(connection, refuse, by_us=by_us)
         if connection.lane != Lane.BULK and connection.expected is not None:
             guid, connection.expected = connection.expected, None
-            self._peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
+            self.peering.dial_refused(guid, refuse, now, connection.remote_endpoint)
             self._act()
+
+    def tls_failed(self, connection: Connection, error: ssl.SSLError) -> None:
+        """Take in an error of TLS behind its handshake, as one of the two sides saw it."""
+        failure = tls_failure(error)
+        self.refused(connection, failure.refuse, by_us=failure.by_us)
 
     def _distrusted(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
         """Show a refusal for trust that concerns a connection which the peer dialled, or which was up."""
         if not by_us:
             _log_refusal(connection.name, refuse)
-        link = self._links.get(connection.id)
-        if link is not None and link.used:
+        link = connection.link
+        if link is not None and link.used and link.connection is connection:
             # Not when its socket is closed: a revoked peer need not answer the refusal.
-            self._peering.link_down(link.id, str(refuse), self.clock.now())
+            self.peering.link_down(link, str(refuse), self.clock.now())
             self._act()
         if connection.remote is not None:
-            self._peering.link_refused(connection.remote.guid, refuse)
+            self.peering.link_refused(connection.remote.guid, refuse)
 
     def ended(self, connection: Connection, reason: str) -> None:
         """Handle the end of a connection: of a dial, of a link, or of a bulk lane, without which the link goes on."""
         now = self.clock.now()
-        del self._connections[connection.id]
+        self._connections.remove(connection)
         if connection.malformed:
-            self._refusals.refuse(now, "link.malformed", connection.remote_endpoint[0], reason)
+            self.refusals.refuse(now, "link.malformed", connection.remote_endpoint[0], reason)
         elif connection.since is None and not connection.dialled:
             self.counters.add("link.unfinished")
             _log.debug("! %s: %s", connection.name, reason)
@@ -267,26 +236,25 @@ class Mesh:
             self._bulk_ended(connection, reason)
             return
         if connection.expected is not None:
-            self._peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
-        if (link := self._links.get(connection.id)) is not None:
+            self.peering.dial_failed(connection.expected, reason, now, connection.remote_endpoint)
+        if (link := connection.link) is not None:
             if discarded := link.discard():
                 self.counters.add("link.discarded", discarded)
             needed = connection.keepalive.remote_lease <= limits.EXPRESS_LEASE  # that of a link at rest is longer
-            self._peering.link_down(link.id, reason, now, silent=connection.silent, needed=needed)
+            self.peering.link_down(link, reason, now, silent=connection.silent, needed=needed)
         self._act()
-        self._links.pop(connection.id, None)
 
     def _bulk_ended(self, bulk: Connection, reason: str) -> None:
         _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
-        for link in list(self._links.values()):
-            if link.bulk_connection is bulk:
-                link.detach(bulk)
-            elif bulk.expected != link.guid:
-                continue
-            if link.used:
-                self.counters.add("link.bulk_lost")
-                _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
-                self.dial_bulk(link, link.backoff.delay() if link.dialled else 0.0)
+        link = bulk.link
+        if link is not None:
+            link.detach(bulk)
+        elif bulk.expected is not None:
+            link = self.link(bulk.expected)
+        if link is not None and link.used:
+            self.counters.add("link.bulk_lost")
+            _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
+            self.dial_bulk(link, link.backoff.delay() if link.dialled else 0.0)
 
     def _act(self) -> None:
         """Carry out what the peering machine asks for; a call from within a callback leaves it to the outer call."""
@@ -294,7 +262,7 @@ class Mesh:
             return
         self._acting = True
         try:
-            while outputs := self._peering.take():
+            while outputs := self.peering.take():
                 for output in outputs:
                     self._do(output)
         finally:
@@ -302,21 +270,19 @@ class Mesh:
         if self._running:
             self._timer.arm()
 
-    def _do(self, output: PeeringOutput) -> None:
+    def _do(self, output: PeeringOutput[PeerLink]) -> None:
         match output:
             case ("dial", guid, endpoints, briefly):
                 if self._running:
                     self._tasks.start(self._dial(guid, endpoints, briefly=briefly), f"dial {guid}")
-            case ("close", link_id, reason):
-                self._links[link_id].close(reason)
-            case ("up", link_id):
-                link = self._links[link_id]
+            case ("close", link, reason):
+                link.close(reason)
+            case ("up", link):
                 link.use(used=True)
                 _log.info("= %s: linked (%s)", link.identity, "dialled" if link.dialled else "accepted")
                 self.handlers.up(link)
                 self.dial_bulk(link)  # the peer may have asked for it before
-            case ("down", link_id, reason):
-                link = self._links[link_id]
+            case ("down", link, reason):
                 self.counters.add("link.replaced" if reason == REPLACED else "link.down")
                 _log.info("= %s: link down: %s", link.identity, reason)
                 link.over = reason
@@ -326,7 +292,7 @@ class Mesh:
                 _log_refusal(identity, refuse)
 
     def _due(self, now: float) -> None:
-        self._peering.handle_timer(now)
+        self.peering.handle_timer(now)
         self._act()
 
     async def _dial(self, guid: Guid, endpoints: tuple[SocketAddress, ...], *, briefly: bool) -> None:
@@ -338,45 +304,28 @@ class Mesh:
             secured = await self._secure(sock)
         except SecuringError as error:
             self.counters.add(f"link.refused.{error.refuse.label}")
-            self._peering.dial_refused(guid, error.refuse, self.clock.now(), endpoint, proved=error.by_us)
+            self.peering.dial_refused(guid, error.refuse, self.clock.now(), endpoint, proved=error.by_us)
         except OSError as error:
             self.counters.add("link.dial_failed")
             within = limits.REDIAL_TIMEOUT if briefly else limits.DIAL_TIMEOUT
             problem = os.strerror(error.errno) if error.errno else f"no answer within {within:g} s"
             text = f"{places}: {problem}" if endpoint is None else f"{endpoint[0]}:{endpoint[1]}: {error}"
-            self._peering.dial_failed(guid, text, self.clock.now(), endpoint)
+            self.peering.dial_failed(guid, text, self.clock.now(), endpoint)
         else:
-            if self._peering.dial_opened(guid, self.clock.now()):
+            if self.peering.dial_opened(guid, self.clock.now()):
                 self._open(sock, endpoint, expected=guid, secured=secured)
             else:
                 sock.close()
         self._act()
 
-    def redial(self, link: PeerLink) -> None:
-        """Try a new connection to the peer of a silent link, because TCP retransmits more and more rarely."""
-        if self._running and _is_over(link.redial):
-            link.redial = self._tasks.start(self._redial(link), f"redial {link.name}")
-
-    async def _redial(self, link: PeerLink) -> None:
-        """Replace a link without acknowledgements as soon as the peer can be reached again, on any path."""
-        while link.is_silent():
-            endpoints = list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
-            try:
-                sock, endpoint = await self.dialler.dial(endpoints, briefly=True)
-                if not link.is_silent() or not link.connection.stream.unacknowledged:
-                    sock.close()  # it ended meanwhile, or is silent, but not for want of a way to it
-                    return
-                secured = await self._secure(sock)
-            except OSError as error:
-                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
-                await asyncio.sleep(limits.REDIAL_PAUSE)
-            else:
-                self._open(sock, endpoint, link=link, secured=secured)
-                return
+    def link_silent(self, link: PeerLink) -> None:
+        """Take in that nothing comes over a link that this side dialled."""
+        self.peering.link_silent(link)
+        self._act()
 
     def dial_bulk(self, link: PeerLink, delay: float = 0.0) -> None:
         """Dial the bulk lane of a link in ``delay`` seconds, if it is wanted and missing, and this side has to."""
-        missing = link.bulk_connection is None and _is_over(link.bulk_dial)
+        missing = link.bulk_connection is None and (link.bulk_dial is None or link.bulk_dial.done())
         if self._running and link.used and link.dialled and link.bulk_wanted and missing:
             link.bulk_dial = self._tasks.start(self._dial_bulk(link, delay), f"bulk {link.name}")
 
@@ -392,15 +341,18 @@ class Mesh:
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
                 await asyncio.sleep(link.backoff.delay())
             else:
-                self._open(sock, link.remote_endpoint, link=link, lane=Lane.BULK, secured=secured)
+                if link.used:
+                    self._open(sock, link.remote_endpoint, expected=link.guid, lane=Lane.BULK, secured=secured)
+                else:
+                    sock.close()  # the link ended meanwhile
                 return
 
     async def _secure(self, sock: socket.socket) -> SecuredSocket | None:
         """Do the TLS handshake of a dialled connection in a secured mesh; closes the socket if it fails."""
-        if self._security is None:
+        if self._securing is None:
             return None
         try:
-            return await secure_dialled(sock, self._security)
+            return await self._securing.dialled(sock)
         except BaseException:
             sock.close()
             raise
@@ -411,26 +363,20 @@ class Mesh:
         endpoint: SocketAddress,
         *,
         expected: Guid | None = None,
-        link: PeerLink | None = None,
         lane: Lane = Lane.EXPRESS,
         secured: SecuredSocket | None = None,
     ) -> None:
-        """Begin the handshake of a connection that was accepted, or dialled to ``expected`` or for a link."""
-        if link is not None and not link.used:
-            sock.close()  # the link ended meanwhile
-            return
-        number, guid = next(self._ids), expected if link is None else link.guid
-        self._connections[number] = Connection(
-            number, self, sock, endpoint, dialled=guid is not None, expected=guid, lane=lane, secured=secured
-        )
+        """Begin the handshake of a connection that was accepted, or dialled to ``expected``."""
+        self._connections.append(Connection(self, sock, endpoint, expected=expected, lane=lane, secured=secured))
 
     def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
         if self._securing is not None:
             self._securing.accept(sock, address)
         else:
-            self._secured(sock, address, None)
+            self.secured(sock, address, None)
 
-    def _secured(self, sock: socket.socket, address: SocketAddress, secured: SecuredSocket | None) -> None:
+    def secured(self, sock: socket.socket, address: SocketAddress, secured: SecuredSocket | None) -> None:
+        """Begin the handshake of an accepted connection, which is secured where the mesh is."""
         host = address[0]
         pending = [c.remote_endpoint[0] for c in self.connections() if c.since is None and not c.dialled]
         there = pending.count(host)
@@ -440,16 +386,4 @@ class Mesh:
         else:
             sock.close()
             text = f"closed a connection from {host}: too many have not said who they are ({there} from there)"
-            self._refusals.refuse(self.clock.now(), "link.pending_full", host, text)
-
-    def _denied(self) -> None:
-        """End the links whose peers are on the new deny list."""
-        for connection in self.connections():
-            remote = connection.remote
-            if connection.up and remote is not None and (refuse := self._prove(connection, remote)):
-                connection.refuse(refuse, self.clock.now())
-                connection.flush()
-
-
-def _is_over(task: asyncio.Task[None] | None) -> bool:
-    return task is None or task.done()
+            self.refusals.refuse(self.clock.now(), "link.pending_full", host, text)

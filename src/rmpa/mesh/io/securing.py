@@ -13,9 +13,8 @@ import logging
 import socket
 import ssl
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.timers import TokenBucket
@@ -27,11 +26,11 @@ from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
-    from rmpa.core.identity import Identity
-    from rmpa.core.log import RefusalLog
     from rmpa.mesh.frames import Hello
+    from rmpa.mesh.io.link import Connection
+    from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import SocketAddress
-    from rmpa.runtime.loop import SystemClock
+    from rmpa.trust.certificates import ModuleCertificate
     from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)
@@ -50,10 +49,9 @@ _UNPROVEN_PAUSE: Final = 0.05
 # How long a connection whose certificate was refused may still send, so that it reads the alert.
 _REFUSAL_LINGER: Final = 0.5
 
-# A verified certificate as ``SSLObject.getpeercert`` returns it.
-Certificate = Mapping[str, Any]
-# What encrypts a connection behind its TLS handshake, and its certificate, verified but for name and deny list.
-SecuredSocket = tuple[SecureSocket, Certificate]
+# What encrypts a connection behind its TLS handshake, and the remote side's certificate, whose times, name and
+# revocation are judged again whenever they may have changed.
+SecuredSocket = tuple[SecureSocket, "ModuleCertificate"]
 OnJoin = Callable[[socket.socket, TlsHandshake, str], Awaitable[None]]
 
 _READ: Final = 16 * 1024
@@ -85,37 +83,6 @@ def refusal(reason: TrustReason, problem: str) -> Refuse:
     return Refuse(reason, f"{problem}; {reason.remedy}")
 
 
-def prove(
-    hello: Hello,
-    certificate: Certificate,
-    security: Membership,
-    linked: Iterable[tuple[Identity, bool]],
-    others: int = 0,
-) -> Refuse | None:
-    """Judge whether a hello is of the module that its certificate is of, and has not too many already; ``None``: yes.
-
-    Args:
-        hello: The remote side's hello or welcome.
-        certificate: Its certificate.
-        security: This module's membership.
-        linked: The peers with links, each with whether its link is alive. No other module may claim the run of one of
-            them. Another module may have the address of one whose link is silent: it may have come after it.
-        others: The other connections that are up with this name.
-    """
-    try:
-        security.judge_member(certificate, hello.name)
-    except TrustError as error:
-        return refusal(error.reason, str(error))
-    for peer, alive in linked:
-        same_place = alive and peer.guid.place == hello.guid.place
-        if peer.name != hello.name and (same_place or peer.instance == hello.instance):
-            return refusal(TrustReason.NAME, f"{hello.name} says that it is the run of {peer}, which is linked")
-    if others >= limits.CONNECTIONS_PER_NAME:
-        text = f"{hello.name} has {others} connections here, a module needs two: is its certificate used elsewhere?"
-        return Refuse(Refusal.BUSY, f"{text} Then: rmpa trust revoke {hello.name}")
-    return None
-
-
 def tls_failure(error: ssl.SSLError) -> SecuringError:
     """What an error of TLS means: a certificate that this side refuses, or an alert of the other side."""
     name = error.reason or ""
@@ -127,28 +94,6 @@ def tls_failure(error: ssl.SSLError) -> SecuringError:
         reason, text = known if known is not None else (TrustReason.FOREIGN, f"it ended TLS by {name}")
         return SecuringError(refusal(reason, text), by_us=False)
     return SecuringError(refusal(TrustReason.DOWNGRADE, f"it does not speak TLS 1.3 ({name})"), by_us=True)
-
-
-async def secure_dialled(sock: socket.socket, security: Membership) -> SecuredSocket:
-    """Do the TLS handshake of a connection that this side dialled; the caller closes it.
-
-    Raises:
-        SecuringError: One side refuses the other.
-        OSError: The connection ended, or the handshake took longer than ``SECURING_TIMEOUT``.
-    """
-    handshake = TlsHandshake(security.client_context, server_side=False)
-    handshake.receive(b"")
-    loop = asyncio.get_running_loop()
-    try:
-        async with asyncio.timeout(SECURING_TIMEOUT):
-            await loop.sock_sendall(sock, handshake.take_output())
-            first = await _received(sock)
-            if first[0] not in (_TLS_HANDSHAKE, _TLS_ALERT):
-                raise await _plain_refusal(sock, first)
-            await _shake(sock, handshake, first)
-    except TimeoutError:
-        raise TimeoutError(f"no end of the TLS handshake within {SECURING_TIMEOUT:g} s") from None
-    return _secured(sock, handshake)
 
 
 async def _received(sock: socket.socket) -> bytes:
@@ -195,41 +140,99 @@ async def _shake(sock: socket.socket, handshake: TlsHandshake, data: bytes) -> N
         data = await _received(sock)
 
 
-def _secured(sock: socket.socket, handshake: TlsHandshake) -> SecuredSocket:
-    tls = handshake.tls
-    if tls.version() != "TLSv1.3" or tls.selected_alpn_protocol() != ALPN_LINK:
-        text = f"it speaks {tls.version()} with {tls.selected_alpn_protocol()}, not TLSv1.3 with {ALPN_LINK}"
-        raise SecuringError(refusal(TrustReason.DOWNGRADE, text), by_us=True)
-    return handshake.secure(sock), tls.getpeercert() or {}
-
-
-@dataclass(eq=False)
 class Securing:
-    """Secures the accepted connections.
+    """What secures the connections of a mesh.
 
     Args:
+        mesh: Its connections.
         security: This module's membership.
-        clock: The time.
-        refusals: Counts and logs what is refused, as ``link.refused.<reason>``.
-        on_secured: A connection is a member's; the callee owns the socket.
-        on_refused: ``(address, refusal)``: a certificate was refused.
         on_join: Serves a join or renewal; ``None``: this module is not the authority.
-        pause: Stops accepting for some seconds, because too many connections are no member's.
     """
 
-    security: Membership
-    clock: SystemClock
-    refusals: RefusalLog
-    on_secured: Callable[[socket.socket, SocketAddress, SecuredSocket], None]
-    on_refused: Callable[[str, Refuse], None]
-    on_join: OnJoin | None
-    pause: Callable[[float], None]
-
-    def __post_init__(self) -> None:
+    def __init__(self, mesh: Mesh, security: Membership, on_join: OnJoin | None) -> None:
+        self._mesh = mesh
+        self._security = security
+        self._on_join = on_join
         self._bad = TokenBucket(limits.UNPROVEN_RATE, UNPROVEN_BURST)
         # Connections without a finished handshake, each with its address; the oldest first.
         self._unproven: dict[asyncio.Task[None], str] = {}
         self._answers = TokenBucket(_PLAIN_ANSWERS_RATE, _PLAIN_ANSWERS_RATE)
+        security.on_denied.append(self._denied)
+
+    def prove(self, connection: Connection, hello: Hello) -> Refuse | None:
+        """Judge whether a hello is of the module that its connection's certificate is of; ``None``: it is.
+
+        No other module may claim the run of one that is linked. It may have the address of one whose link is silent:
+        it may have come after it. A module has only so many connections.
+        """
+        assert connection.certificate is not None  # noqa: S101 - each connection of a secured mesh has one
+        try:
+            self._security.judge_member(connection.certificate, hello.name)
+        except TrustError as error:
+            return refusal(error.reason, str(error))
+        for link in self._mesh.links():
+            peer, same_place = link.identity, link.alive and link.guid.place == hello.guid.place
+            if peer.name != hello.name and (same_place or peer.instance == hello.instance):
+                return refusal(TrustReason.NAME, f"{hello.name} says that it is the run of {peer}, which is linked")
+        others = (each.remote for each in self._mesh.connections() if each.up and each is not connection)
+        named = sum(other is not None and other.name == hello.name for other in others)
+        if named < limits.CONNECTIONS_PER_NAME:
+            return None
+        text = f"{hello.name} has {named} connections here, a module needs two: is its certificate used elsewhere?"
+        return Refuse(Refusal.BUSY, f"{text} Then: rmpa trust revoke {hello.name}")
+
+    def _denied(self) -> None:
+        """End the links whose peers are on the new deny list."""
+        for connection in self._mesh.connections():
+            remote = connection.remote
+            if connection.up and remote is not None and (refuse := self.prove(connection, remote)):
+                connection.refuse(refuse, self._mesh.clock.now())
+                connection.flush()
+
+    async def dialled(self, sock: socket.socket) -> SecuredSocket:
+        """Do the TLS handshake of a connection that this side dialled; the caller closes it.
+
+        Raises:
+            SecuringError: One side refuses the other.
+            OSError: The connection ended, or the handshake took longer than ``SECURING_TIMEOUT``.
+        """
+        handshake = TlsHandshake(self._security.client_context, server_side=False)
+        handshake.receive(b"")
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(SECURING_TIMEOUT):
+                await loop.sock_sendall(sock, handshake.take_output())
+                first = await _received(sock)
+                if first[0] not in (_TLS_HANDSHAKE, _TLS_ALERT):
+                    raise await _plain_refusal(sock, first)
+                await _shake(sock, handshake, first)
+        except TimeoutError:
+            raise TimeoutError(f"no end of the TLS handshake within {SECURING_TIMEOUT:g} s") from None
+        return self._secured(sock, handshake)
+
+    def _secured(self, sock: socket.socket, handshake: TlsHandshake) -> SecuredSocket:
+        """The connection of a member behind its handshake; an acceptor tells its refusal inside TLS.
+
+        Raises:
+            SecuringError: It has no certificate of this mesh, or is for something else than a link.
+        """
+        tls = handshake.tls
+        if tls.version() != "TLSv1.3" or tls.selected_alpn_protocol() != ALPN_LINK:
+            text = f"it speaks {tls.version()} with {tls.selected_alpn_protocol()}, not TLSv1.3 with {ALPN_LINK}"
+            raise SecuringError(refusal(TrustReason.DOWNGRADE, text), by_us=True)
+        secured = handshake.secure(sock)
+        try:
+            certificate = self._security.read_member(tls.getpeercert(binary_form=True))
+            if tls.server_side:
+                # Before its hello, which a module without a certificate that holds could hold back.
+                self._security.judge_member(certificate, None)
+        except TrustError as error:
+            refuse = refusal(error.reason, str(error))
+            if tls.server_side:
+                with contextlib.suppress(OSError):
+                    secured.sendmsg([Frame(FrameKind.REFUSE, refuse.serialize()).serialize()])
+            raise SecuringError(refuse, by_us=True) from None
+        return secured, certificate
 
     def accept(self, sock: socket.socket, address: SocketAddress) -> None:
         """Do the handshake of a connection; the socket belongs to this object from here on."""
@@ -241,6 +244,7 @@ class Securing:
 
     async def close(self) -> None:
         """Close what is not secured yet."""
+        self._security.on_denied.remove(self._denied)
         await end_tasks(*self._unproven)
 
     def _ended(self, task: asyncio.Task[None], sock: socket.socket) -> None:
@@ -262,14 +266,14 @@ class Securing:
         del self._unproven[oldest]
         oldest.cancel()
         text = f"closed a connection from {host}: too many have not shown that they are of this mesh"
-        self.refusals.refuse(self.clock.now(), "link.pending_full", host, text)
+        self._mesh.refusals.refuse(self._mesh.clock.now(), "link.pending_full", host, text)
         self._note_bad()
 
     def _note_bad(self) -> None:
         """Leave a flood of connections that are no member's to the kernel for a moment."""
-        if not self._bad.take(self.clock.now()):
-            self.refusals.count("link.paused")
-            self.pause(_UNPROVEN_PAUSE)
+        if not self._bad.take(self._mesh.clock.now()):
+            self._mesh.refusals.count("link.paused")
+            self._mesh.acceptor.pause(_UNPROVEN_PAUSE)
 
     async def _secure(self, sock: socket.socket, address: SocketAddress) -> None:
         host = address[0]
@@ -279,18 +283,18 @@ class Securing:
         except SecuringError as error:
             self._note_bad()
             text = f"{'refused a link with' if error.by_us else 'no link with'} {host}: {error}"
-            self.refusals.refuse(self.clock.now(), f"link.refused.{error.refuse.label}", host, text)
-            self.on_refused(host, error.refuse)
+            self._mesh.refusals.refuse(self._mesh.clock.now(), f"link.refused.{error.refuse.label}", host, text)
+            self._mesh.peering.refused_from(host, error.refuse)
             await _linger(sock)
         except (OSError, RmpaError) as error:  # TimeoutError too
             self._note_bad()
-            self.refusals.count("link.unfinished")
+            self._mesh.refusals.count("link.unfinished")
             _log.debug("! %s: no TLS handshake: %s", host, str(error) or "no answer in time")
         finally:
             if secured is None:
                 sock.close()
         if secured is not None:
-            self.on_secured(sock, address, secured)
+            self._mesh.secured(sock, address, secured)
 
     async def _proved(self, sock: socket.socket, host: str) -> SecuredSocket | None:
         """The connection of a member; ``None``: it is none, and nothing is to be told of it.
@@ -308,29 +312,21 @@ class Securing:
             if first[0] != _TLS_HANDSHAKE:
                 self._refuse_plain(sock, host)
                 return None
-            handshake = TlsHandshake(self.security.server_context, server_side=True)
+            handshake = TlsHandshake(self._security.server_context, server_side=True)
             await _shake(sock, handshake, first)
-        if self.on_join is not None and handshake.tls.selected_alpn_protocol() == ALPN_JOIN:
-            await self.on_join(sock, handshake, host)
+        if self._on_join is not None and handshake.tls.selected_alpn_protocol() == ALPN_JOIN:
+            await self._on_join(sock, handshake, host)
             await _linger(sock)
             return None
-        secured = _secured(sock, handshake)
-        try:
-            # Before its hello, which a module without a certificate that holds could hold back.
-            self.security.judge_member(secured[1], None)
-        except TrustError as error:
-            refuse = refusal(error.reason, str(error))
-            with contextlib.suppress(OSError):
-                secured[0].sendmsg([Frame(FrameKind.REFUSE, refuse.serialize()).serialize()])
-            raise SecuringError(refuse, by_us=True) from None
-        return secured
+        return self._secured(sock, handshake)
 
     def _refuse_plain(self, sock: socket.socket, host: str) -> None:
         """Count, and answer unless there are many."""
         self._note_bad()
-        now, refuse = self.clock.now(), refusal(TrustReason.PLAIN, "the dialler is not secured, but this mesh is")
+        now = self._mesh.clock.now()
+        refuse = refusal(TrustReason.PLAIN, "the dialler is not secured, but this mesh is")
         text = f"refused a connection from {host}: {refuse.text}"
-        self.refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
+        self._mesh.refusals.refuse(now, f"link.refused.{refuse.label}", host, text)
         if self._answers.take(now):
             with contextlib.suppress(OSError):
                 sock.send(Frame(FrameKind.REFUSE, refuse.serialize()).serialize())

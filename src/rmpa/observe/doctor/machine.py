@@ -34,7 +34,7 @@ from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import read_survey, survey_calls
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.realtime import REMEDY
+from rmpa.runtime.loop import REALTIME_REMEDY
 from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ def judge_rights(fifo: str, memlock: int | None, files: int | None, *, wanted: b
     if not missing:
         yield Check("realtime", OK, "SCHED_FIFO and locked memory are allowed")
     elif wanted:
-        yield Check("realtime", WARN, "; ".join(missing), REMEDY)
+        yield Check("realtime", WARN, "; ".join(missing), REALTIME_REMEDY)
     else:
         yield Check("realtime", OK, f"{'; '.join(missing)}; not asked for (rmpa up --realtime)")
     # Each subscriber takes one, and a proxy two where proxies cannot share their sockets.

@@ -27,7 +27,7 @@ from rmpa.core.errors import StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.network import CONTAINERS, choose, join_group, list_interfaces, open_receiver, receive
-from rmpa.mesh.io.dial import may_use_bbr, repeats_quickly
+from rmpa.mesh.io.lane import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import ask_program, resolve

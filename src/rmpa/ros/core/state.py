@@ -27,8 +27,8 @@ from rmpa.ros.master.registrations import Name, NodeRecord
 from rmpa.ros.node.ask import IDENTIFY_ID, name_at
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_response
 from rmpa.runtime.accept import in_thread
-from rmpa.runtime.files import replace_file, set_aside
 from rmpa.runtime.loop import yielding_to_data
+from rmpa.runtime.programs import replace_file, set_aside
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import msgspec
 
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.runtime.files import replace_file
 from rmpa.runtime.interpreter import own_command
+from rmpa.runtime.programs import replace_file
 from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:

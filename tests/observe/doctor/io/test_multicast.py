@@ -11,8 +11,8 @@ import pytest
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import StartError
 from rmpa.core.statistics import Counters
+from rmpa.discovery.beacon import PacketFilter
 from rmpa.discovery.network import Interface, list_interfaces, receive
-from rmpa.discovery.packet_filter import PacketFilter
 from rmpa.observe import limits
 from rmpa.observe.doctor import network as multicast
 from rmpa.observe.doctor.network import hear
