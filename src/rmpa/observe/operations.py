@@ -17,7 +17,6 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge import nodes as node_requests
 from rmpa.bridge.kept import Kept
 from rmpa.bridge.log import LEVEL
-from rmpa.bridge.log_ring import ModuleLog
 from rmpa.bridge.params import owner as param_requests
 from rmpa.bridge.recordings import ModuleRecordings
 from rmpa.bridge.topics.rates import RATES
