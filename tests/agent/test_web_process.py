@@ -179,7 +179,8 @@ async def test_one_that_is_not_wanted_any_more_is_ended(child: Make) -> None:
     former = child(WAITS)
     await kill_agent(former)
     await child(WAITS).stop()
-    assert former.pid is None
+    assert former._child is not None
+    assert former._child.poll() is not None
 
 
 def test_its_command_and_environment_have_what_the_agent_was_told(

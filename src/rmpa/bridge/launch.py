@@ -25,7 +25,7 @@ from rmpa.bridge.launched import (
     load_runs,
 )
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import meant, no_such_module
+from rmpa.bridge.rpc import gate_for, meant, no_such_module
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
@@ -250,7 +250,7 @@ class Launcher(Part):
             return ModuleResources(module=self._name, problem=str(error), code=error.code)
 
     def _check(self, asker: PeerSession, what: object, name: object) -> None:
-        gate, peer = self._bridge.context.gate_for(asker)
+        gate, peer = gate_for(self._bridge, asker)
         if not gate.on and not self._bridge.context.settings.resources.open:
             rule = "the mesh is not secured, and open of [resources] is false"
             gate.refused(Access.LAUNCH, peer, "a resource", PermissionDecision(False, rule))
@@ -287,7 +287,7 @@ class Launcher(Part):
         return await self._bridge.rpc.ask(session, LAUNCH, request, ModuleResources, timeout)
 
     async def _do(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleResources:
-        what, name, (gate, peer) = str(args.get("what")), args.get("name"), self._bridge.context.gate_for(asker)
+        what, name, (gate, peer) = str(args.get("what")), args.get("name"), gate_for(self._bridge, asker)
         if what not in ACTS:
             raise RmpaError(f"{what[:64]!r} is no question; there are {', '.join(ACTS)}", code="invalid-value")
         files = await self._files()

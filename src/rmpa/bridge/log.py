@@ -15,7 +15,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import meant, no_such_module
+from rmpa.bridge.rpc import gate_for, meant, no_such_module
 from rmpa.bridge.sessions import Part
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RmpaError
@@ -141,7 +141,7 @@ class ModuleLogs(Part):
         subscription.update(list(self._core.publishers(subscription.topic).values()))
 
     def _lines(self, asker: PeerSession | None, args: Mapping[str, Any]) -> ModuleLog:
-        query, (gate, peer) = LogQuery.of(args), self._bridge.context.gate_for(asker)
+        query, (gate, peer) = LogQuery.of(args), gate_for(self._bridge, asker)
         allowed = {node for node in self.ring.nodes if not gate.on or gate.judge(Access.LOG, peer, node).allowed}
         if not allowed and (why := gate.why_not(Access.LOG, peer, query.node or OWN_NODE)):
             raise RmpaError(why, code="not-permitted")

@@ -13,6 +13,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import Needs
+from rmpa.bridge.rpc import gate_for
 from rmpa.bridge.sessions import Part
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config import limits as config_limits
@@ -213,7 +214,7 @@ class Nodes(Part):
 
     def _tables(self, asker: PeerSession | None) -> tuple[_Table, _Table, _Table]:
         """The nodes by published topic, by subscribed topic and by service: by those that the asker may have."""
-        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
+        state, (gate, peer) = self._core.state(), gate_for(self._bridge, asker)
 
         def permitted(access: Access, table: _Table) -> _Table:
             if not gate.on:
@@ -229,7 +230,7 @@ class Nodes(Part):
 
     def _visible(self, asker: PeerSession | None) -> Collection[str]:
         """The nodes that the asker is told of: those of which it may have something."""
-        if not self._bridge.context.gate_for(asker)[0].on:
+        if not gate_for(self._bridge, asker)[0].on:
             return self._core.state().nodes
         return {node for table in self._tables(asker) for nodes in yielding_to_data(table.values()) for node in nodes}
 
@@ -240,7 +241,7 @@ class Nodes(Part):
             RmpaError: There is no such node.
         """
         node, uri = own_node(self._bridge, args, self._visible(asker))
-        state, (gate, peer) = self._core.state(), self._bridge.context.gate_for(asker)
+        state, (gate, peer) = self._core.state(), gate_for(self._bridge, asker)
         facts = describe_node(node, uri, *self._tables(asker), state.types)
         try:
             answer = await ping_node(node, uri, OWN_NODE)
@@ -323,7 +324,7 @@ def permitted_nodes(
     Raises:
         RmpaError: It may not with the ``node`` of its request, whether there is one or not.
     """
-    (gate, peer), named = bridge.context.gate_for(asker), str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
+    (gate, peer), named = gate_for(bridge, asker), str(args.get("node"))[: config_limits.CROSSING_NAME_MAX]
     if why := gate.why_not(access, peer, named):
         raise RmpaError(why, code="not-permitted")
     return [node for node in bridge.core.state().nodes if gate.judge(access, peer, node).allowed]

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.messages import Origin, Source
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.peer_rules import Access, PeerRule, ServiceRule
     from rmpa.config.settings import ServiceSettings, TrustSettings
     from rmpa.core.contract import Contracts, Transport
@@ -459,10 +458,6 @@ class BridgeContext:
         policy = Policy(settings.policy, settings.peers, settings.time, rosout=settings.rosout)
         names, services = Names(settings.naming), ServiceRules(settings.services)
         return cls(settings, policy, services, names, settings.make_contracts(), gate)
-
-    def gate_for(self, asker: PeerSession | None) -> tuple[PermissionGate, str]:
-        """What decides about the answer to a question, and the peer's name; a program of this module may have all."""
-        return (self.gate, asker.link.name) if asker is not None else (OPEN_GATE, "")
 
     def limit(self, kind: str) -> int:
         """The most ``topics`` or ``services`` of a module that cross."""

@@ -21,7 +21,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import meant
+from rmpa.bridge.rpc import gate_for, meant
 from rmpa.bridge.sessions import Part
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
@@ -172,13 +172,13 @@ class Recordings(Part):
         return await self._keep_here(moved)
 
     def _check(self, asker: PeerSession | None, name: object) -> str:
-        kept, (gate, peer) = check_id(str(name)), self._bridge.context.gate_for(asker)
+        kept, (gate, peer) = check_id(str(name)), gate_for(self._bridge, asker)
         if why := gate.why_not(Access.RECORD, peer, f"/{kept}"):
             raise RmpaError(why, code="not-permitted")
         return kept
 
     async def _list(self, asker: PeerSession | None, _args: Mapping[str, Any]) -> ModuleRecordings:
-        gate, peer = self._bridge.context.gate_for(asker)
+        gate, peer = gate_for(self._bridge, asker)
         found = await asyncio.to_thread(self._here)
         kept = tuple(one for one in found.kept if not gate.why_not(Access.RECORD, peer, f"/{one.id}"))
         why = gate.why_not(Access.RECORD, peer, _ANY)  # it names the topics

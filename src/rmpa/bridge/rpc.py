@@ -23,6 +23,7 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Notification, Request, Response, decode, encode, with_text, without_text
+from rmpa.bridge.policy import OPEN_GATE
 from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.sessions import Part
 from rmpa.config.values import suggestion
@@ -42,8 +43,9 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Message
-    from rmpa.bridge.policy import Needs
+    from rmpa.bridge.policy import Needs, PermissionGate
     from rmpa.bridge.sessions import PeerSession
     from rmpa.core.statistics import Counters
 
@@ -62,6 +64,11 @@ _EARLIER: Final = "its agent is of an earlier release, which does not know this;
 
 
 _Answer = TypeVar("_Answer", bound=ModuleAnswer)
+
+
+def gate_for(bridge: Bridge, asker: PeerSession | None) -> tuple[PermissionGate, str]:
+    """What decides about the answer to a question, and the peer's name; a program of this module may have all."""
+    return (bridge.context.gate, asker.link.name) if asker is not None else (OPEN_GATE, "")
 
 
 def meant(sessions: Iterable[PeerSession], module: object) -> list[PeerSession]:
