@@ -27,10 +27,9 @@ from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printabl
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.ros.node.endpoints import Publisher
-    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.endpoints import MasterClient, Publisher
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer
@@ -213,11 +212,13 @@ class RosoutHandler(logging.Handler):
 
     Args:
         node: The node; each message has the topics that it publishes.
+        advertise: ``Node.advertise``.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: MasterClient, advertise: Callable[..., Awaitable[Publisher]]) -> None:
         super().__init__()
         self._node = node
+        self._advertise = advertise
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[dict[str, object]] = deque(maxlen=_RECORDS_MAX)
         self._publisher: Publisher | None = None
@@ -258,7 +259,7 @@ class RosoutHandler(logging.Handler):
         publisher: Publisher | None = None
         while publisher is None:
             try:
-                publisher = await self._node.advertise(_ROSOUT, _LOG_TYPE, latch=True)
+                publisher = await self._advertise(_ROSOUT, _LOG_TYPE, latch=True)
             except RmpaError as error:
                 _log.debug("! %s: %s", self._node.name, error)
                 await asyncio.sleep(_RETRY)

@@ -508,7 +508,7 @@ class Node(MasterClient):
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
             logger.setLevel(logging.INFO)
-        self._rosout = RosoutHandler(self)
+        self._rosout = RosoutHandler(self, self.advertise)
         logger.addHandler(self._rosout)
         return logger
 
