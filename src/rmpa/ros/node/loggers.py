@@ -59,20 +59,29 @@ def level_of(number: int) -> int:
     return max(0, sum(level <= number for level in LEVELS.values()) - 1)
 
 
-def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
+def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> Callable[[], None]:
     """Serve the two services of a node's loggers, and register them; the node listens already.
 
     Args:
         node: Serves them, until it is closed.
         call: Calls the core's master.
         loggers: The name of Python's logger, by the name that the services show.
+
+    Returns:
+        A function that unregisters them.
     """
-    for name, serve, description in (("get_loggers", _get, GET), ("set_logger_level", _set, SET)):
-        service = f"{node.name}/{name}"
+    served = {f"{node.name}/get_loggers": (_get, GET), f"{node.name}/set_logger_level": (_set, SET)}
+    for service, (serve, description) in served.items():
         node.add_service(ServiceEndpoint(service, node.name, partial(serve, loggers), description=description))
         code, text, _ = call("registerService", node.name, service, node.service_uri, node.uri)
         if code != 1:
             _log.error("! the ROS core does not accept %s: %s [core-refuses]", service, text)
+
+    def end() -> None:
+        for service in served:
+            call("unregisterService", node.name, service, node.service_uri)
+
+    return end
 
 
 def _get(loggers: Mapping[str, str], call: ServiceCall) -> None:
