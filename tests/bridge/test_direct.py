@@ -30,8 +30,7 @@ from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract, Transport
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime import kernel_tcp
 from rmpa.runtime.kernel_tcp import connections, may_end_connections

@@ -489,7 +489,7 @@ class Agent:
             diagnostics = Diagnostics(self._facts, self.snapshots)
             diagnostics.start()
             undo.callback(diagnostics.close)
-            serve_loggers(self.bridge.node, self.core.call, _LOGGERS)
+            undo.callback(serve_loggers(self.bridge.node, self.core.call, _LOGGERS))
             await self.network.start()
             undo.push_async_callback(self.network.close)
             await self.control.start()

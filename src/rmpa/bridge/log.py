@@ -23,7 +23,7 @@ from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
-from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.node.slave_node import Subscription
 from rmpa.runtime.loop import yielding_to_data
 from rmpa.trust.permissions import asker_name
 

@@ -14,8 +14,7 @@ from rmpa.ros.core.embedded import AGGREGATED, LOG, RosCore
 from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.node import ask
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
 from rmpa.runtime.accept import Use

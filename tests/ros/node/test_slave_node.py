@@ -10,8 +10,7 @@ import pytest
 
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
 from rmpa.ros.wire.slave_api import METHODS, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue

@@ -10,8 +10,8 @@ import pytest
 
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
-from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import PartsTaker, PublisherConnection, Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
+from rmpa.ros.node.subscription import PartsTaker, PublisherConnection
 from rmpa.ros.wire.tcpros import ANYTHING, TopicDescription, encode_header, frame_message, publisher_header
 from tests.ros.node.peers import MD5, STRING, RawPublisher, RawServer
 from tests.waiting import until

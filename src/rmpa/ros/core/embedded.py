@@ -23,8 +23,7 @@ from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.ros.node.loggers import serve_loggers
 from rmpa.ros.node.publication import Publication
-from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import PublisherConnection, Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
 from rmpa.ros.types.definitions import known_description
 from rmpa.ros.wire.log import renamed
 from rmpa.runtime.accept import Use
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.ros.master.parameters import GraphChange
+    from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -235,7 +235,7 @@ class RosCore(Core):
         self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
         super().__init__("", self._api.registrations, self._api.registrations.nodes)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
-        self._notifier = Notifier(self)
+        self._notifier = Notifier(self.registrations, self.suspect, self.counters)
         self._rosout = Rosout(self, host, self._advertised) if rosout else None
         # Topics and slave APIs of withdrawn publishers, and when.
         self._withdrawn: dict[tuple[str, str], float] = {}

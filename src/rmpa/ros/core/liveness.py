@@ -27,8 +27,9 @@ from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task, start_task
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.ros.core.external import Core
+    from rmpa.core.statistics import Counters
     from rmpa.ros.master.parameters import SlaveCall
+    from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)
 
@@ -215,12 +216,15 @@ class Notifier:
     """One queue for each slave API, emptied by a task that runs while there is something in it.
 
     Args:
-        core: The master's core. A failed notification is not sent again once no node has its slave API; each node of
-            one that did not answer may be dead. Counts ``notify.sent``, ``notify.failed`` and ``notify.dropped``.
+        registrations: The master's tables: a failed notification is not sent again once no node has its slave API.
+        suspect: Called with each node of a slave API that did not answer: it may be dead.
+        counters: ``notify.sent``, ``notify.failed``, ``notify.dropped``.
     """
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
+    def __init__(self, registrations: Registrations, suspect: Callable[[str], None], counters: Counters) -> None:
+        self._registrations = registrations
+        self._suspect = suspect
+        self._counters = counters
         self._queues: dict[str, _Queue] = {}
         self._tasks = OwnedTasks()
         self._closed = False
@@ -243,7 +247,7 @@ class Notifier:
         queue[method, name, number] = value
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
             del queue[next(iter(queue))]
-            self._core.counters.add("notify.dropped")
+            self._counters.add("notify.dropped")
 
     async def close(self) -> None:
         """Stop at once; queued notifications are not sent."""
@@ -260,7 +264,7 @@ class Notifier:
                     backoff.reset()
                 elif method == "shutdown":
                     continue
-                elif not self._core.registrations.nodes_at(api):
+                elif not self._registrations.nodes_at(api):
                     queue.clear()
                 else:
                     if key not in queue:
@@ -280,26 +284,26 @@ class Notifier:
                 # Given up earlier it might be carried out behind the next one, which is newer.
                 await call(api, method, MASTER_ID, name, value, timeout=limits.TCPROS_CONNECT_TIMEOUT, use=Use.CORE)
         except (UnreachableError, RosFault, RemoteProtocolError, LocalProtocolError) as error:
-            self._core.counters.add("notify.failed")
+            self._counters.add("notify.failed")
             # A shortage is this process's, and is reported elsewhere: the node may be well.
             short = isinstance(error, OutOfDescriptors)
             _log.log(logging.DEBUG if short else logging.INFO, "! %s: %s", api, error)
             if isinstance(error, UnreachableError) and not short:
-                for node in self._core.registrations.nodes_at(api):
-                    self._core.suspect(node)
+                for node in self._registrations.nodes_at(api):
+                    self._suspect(node)
             # Else the node got it, or never will: sending again would not help.
             return not isinstance(error, UnreachableError)
-        self._core.counters.add("notify.sent")
+        self._counters.add("notify.sent")
         return True
 
     async def _shut_down(self, api: str, node: str, topics: XmlRpcValue) -> None:
         """Ask a node whose name another node has taken to end, unless its address is another node's by now."""
         found = await name_at(api, cast("list[str]", topics))
         if found is None:
-            found = next(iter(self._core.registrations.nodes_at(api)), None)
+            found = next(iter(self._registrations.nodes_at(api)), None)
         if found is not None and found != node:
             _log.info("= %s is not asked to end: %s is at %s now", node, found, api)
-            self._core.counters.add("notify.stale")
+            self._counters.add("notify.stale")
             return
         _log.warning("> %s at %s is asked to end: another node has its name [node-killed]", node, api)
         await call(api, "shutdown", MASTER_ID, f"[{node}] Reason: new node registered with same name", use=Use.CORE)

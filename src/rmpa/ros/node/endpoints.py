@@ -21,7 +21,7 @@ from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import one_call
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
-from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.node.slave_node import Subscription
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers, given_values

@@ -1,6 +1,6 @@
-"""The log of a node: its records on ``/rosout``, and the two services of its loggers, served and called.
+"""The loggers of a node: its two services, as every roscpp and rospy node has them, served and called.
 
-Every roscpp and rospy node has both. With ``get_loggers`` and ``set_logger_level`` rqt_logger_level and ``rosservice
+With ``get_loggers`` and ``set_logger_level`` rqt_logger_level and ``rosservice
 call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of a program's log while it runs
 (wiki.ros.org/rosconsole). The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because the
 agent starts without the types' definitions.
@@ -9,11 +9,8 @@ agent starts without the types' definitions.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import re
-import sys
-from collections import deque
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -24,13 +21,10 @@ from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceEndpoint
 from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printable
-from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rmpa.ros.node.endpoints import Publisher
-    from rmpa.ros.node.node import Node
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer
@@ -58,41 +52,42 @@ _OWN: Final = ("rosout", "ros")
 # Debian 12: the node crashes at the next use of its loggers (trap 43).
 _LOG4CXX: Final = re.compile(r"liblog4cxx\.so\.(\d+)")
 _LOG4CXX_SAFE: Final = 10
-_ROSOUT: Final = "/rosout"
-_LOG_TYPE: Final = "rosgraph_msgs/Log"
-# Records that wait for the connection of the core's /rosout; above it the oldest is dropped.
-_RECORDS_MAX: Final = 1000
-# Time in which the core's /rosout connects: what is published before that would be lost.
-_SUBSCRIBED_WITHIN: Final = 1.0
-# Time between two attempts to register at a master that does not answer.
-_RETRY: Final = 1.0
 
 
-def _level_of(number: int) -> int:
+def level_of(number: int) -> int:
     """The highest of ``LEVELS``, from 0 on, that is not above a level of Python's."""
     return max(0, sum(level <= number for level in LEVELS.values()) - 1)
 
 
-def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
+def serve_loggers(node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> Callable[[], None]:
     """Serve the two services of a node's loggers, and register them; the node listens already.
 
     Args:
         node: Serves them, until it is closed.
         call: Calls the core's master.
         loggers: The name of Python's logger, by the name that the services show.
+
+    Returns:
+        A function that unregisters them.
     """
-    for name, serve, description in (("get_loggers", _get, GET), ("set_logger_level", _set, SET)):
-        service = f"{node.name}/{name}"
+    served = {f"{node.name}/get_loggers": (_get, GET), f"{node.name}/set_logger_level": (_set, SET)}
+    for service, (serve, description) in served.items():
         node.add_service(ServiceEndpoint(service, node.name, partial(serve, loggers), description=description))
         code, text, _ = call("registerService", node.name, service, node.service_uri, node.uri)
         if code != 1:
             _log.error("! the ROS core does not accept %s: %s [core-refuses]", service, text)
 
+    def end() -> None:
+        for service in served:
+            call("unregisterService", node.name, service, node.service_uri)
+
+    return end
+
 
 def _get(loggers: Mapping[str, str], call: ServiceCall) -> None:
     parts = [LENGTH.pack(len(loggers))]
     for name, logger in loggers.items():
-        level = _level_of(logging.getLogger(logger).getEffectiveLevel())
+        level = level_of(logging.getLogger(logger).getEffectiveLevel())
         parts += [pack_text(name), pack_text(list(LEVELS)[level])]
     call.reply(True, b"".join(parts))
 
@@ -204,70 +199,3 @@ def _texts(raw: Buffer, count: int, what: str) -> list[str]:
     if at != len(raw) or len(found) != count:
         raise RemoteProtocolError(f"{len(raw)} bytes are not a {what}")
     return found
-
-
-class RosoutHandler(logging.Handler):
-    """Publishes records on ``/rosout``; records may come from any thread.
-
-    A program that does not configure ``logging`` sees them on standard error too.
-
-    Args:
-        node: The node; each message has the topics that it publishes.
-    """
-
-    def __init__(self, node: Node) -> None:
-        super().__init__()
-        self._node = node
-        self._loop = asyncio.get_running_loop()
-        self._waiting: deque[dict[str, object]] = deque(maxlen=_RECORDS_MAX)
-        self._publisher: Publisher | None = None
-        self._task: asyncio.Task[None] | None = None
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Publish a record."""
-        text = self.format(record)
-        if not logging.getLogger().handlers:
-            print(f"[{record.levelname}] [{record.created:.6f}]: {text}", file=sys.stderr)
-        fields: dict[str, object] = {
-            "header": {"stamp": record.created},
-            "level": 1 << _level_of(record.levelno),
-            "name": self._node.name,
-            "msg": text,
-            "file": record.pathname,
-            "function": record.funcName or "",
-            "line": record.lineno,
-        }
-        with contextlib.suppress(RuntimeError):  # the loop is closed: the program ends
-            self._loop.call_soon_threadsafe(self._take, fields)
-
-    async def drained(self) -> None:
-        """Wait until what has been logged is published, for a moment at the most."""
-        await asyncio.sleep(0)  # what other calls have put into the loop comes first
-        if self._task is not None:
-            await asyncio.wait([self._task], timeout=_SUBSCRIBED_WITHIN)
-            self._task.cancel()
-
-    def _take(self, fields: dict[str, object]) -> None:
-        self._waiting.append(fields)
-        if self._publisher is not None:
-            self._publish(self._publisher)
-        elif self._task is None:
-            self._task = keep_task(self._start, f"rosout of {self._node.name}")
-
-    async def _start(self) -> None:
-        publisher: Publisher | None = None
-        while publisher is None:
-            try:
-                publisher = await self._node.advertise(_ROSOUT, _LOG_TYPE, latch=True)
-            except RmpaError as error:
-                _log.debug("! %s: %s", self._node.name, error)
-                await asyncio.sleep(_RETRY)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_SUBSCRIBED_WITHIN):
-                await publisher.wait_for_subscriber()
-        self._publisher = publisher
-        self._publish(publisher)
-
-    def _publish(self, publisher: Publisher) -> None:
-        while self._waiting:
-            publisher.publish(topics=sorted(self._node.slave.publications()), **self._waiting.popleft())

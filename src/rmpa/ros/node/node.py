@@ -40,7 +40,7 @@ from rmpa.ros.node.endpoints import (
 )
 from rmpa.ros.node.fetch_type import find_here, find_or_fetch
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.node.loggers import RosoutHandler
+from rmpa.ros.node.rosout import RosoutHandler
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.ros.types.find import find_service_type
@@ -508,7 +508,7 @@ class Node(MasterClient):
         logger = logging.getLogger("rosout" + self.name.replace("/", "."))
         if logger.level == logging.NOTSET:
             logger.setLevel(logging.INFO)
-        self._rosout = RosoutHandler(self)
+        self._rosout = RosoutHandler(self, self.advertise)
         logger.addHandler(self._rosout)
         return logger
 

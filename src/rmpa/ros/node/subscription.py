@@ -6,7 +6,6 @@ import asyncio
 import logging
 import random
 from abc import ABC, abstractmethod
-from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits as core_limits
@@ -23,9 +22,8 @@ from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.tcpros import Buffer, Header, TopicDescription
 
     Attach = Callable[["InProcessConnection"], None]
@@ -421,97 +419,3 @@ class InProcessConnection(TopicConnection):
         """Drop the message in progress, whose rest will not come; the connection goes on."""
         self._abort()
         return False
-
-
-class Subscription:
-    """A topic that a node of this process subscribes to: one connection to each listed publisher.
-
-    Unlike rospy it disconnects from publishers that are no longer listed. A publisher that refused is tried again
-    when the master lists it again.
-
-    Args:
-        topic: The topic's global name.
-        node: The node, which listens already.
-        on_message: ``(connection, framed)``; the view is only valid during the call.
-        on_refused: ``(connection, text)``.
-        own: Whether the node subscribes to itself too.
-        accepts: Whether the publisher of a slave API is connected to; ``None``: each.
-        wanted: The type and md5 sum to ask for, and the definition to send.
-        nodelay: Whether to ask for TCP_NODELAY.
-    """
-
-    def __init__(
-        self,
-        topic: str,
-        node: SlaveNode,
-        *,
-        on_message: Callable[[PublisherConnection, memoryview], None],
-        on_refused: Callable[[PublisherConnection, str], None] = _ignore,
-        own: bool = False,
-        accepts: Callable[[str], bool] | None = None,
-        wanted: TopicDescription = ANYTHING,
-        nodelay: bool = True,
-    ) -> None:
-        self.topic = topic
-        self.type_name = wanted.type
-        self._connection = partial(PublisherConnection, topic, caller_id=node.name, wanted=wanted, nodelay=nodelay)
-        self._on_message = on_message
-        self._on_refused = on_refused
-        self._node = node
-        self._own = own
-        self._accepts = accepts
-        self._connections: dict[str, PublisherConnection] = {}
-
-    @property
-    def publishers(self) -> int:
-        """Connected publishers."""
-        return sum(connection.connected for connection in self._connections.values())
-
-    @property
-    def callers(self) -> set[str]:
-        """The names of the connected publishers, from their headers."""
-        return {one.fields.get("callerid", "") for one in self._connections.values() if one.connected}
-
-    def connections(self) -> list[BusConnection]:
-        """The rows of all connections in ``getBusInfo`` and ``getBusStats``."""
-        return [connection.connection() for connection in self._connections.values()]
-
-    def update(self, uris: Iterable[str], *, keep: bool = False) -> None:
-        """Apply the master's list of publishers: connect to the new ones, disconnect from the missing ones.
-
-        Args:
-            uris: The slave APIs of the listed publishers.
-            keep: Disconnect from none, because the list of a restarted master is incomplete.
-        """
-        left_out = "" if self._own else self._node.uri
-        listed = {uri for uri in uris if uri != left_out and (self._accepts is None or self._accepts(uri))}
-        for uri, connection in tuple(self._connections.items()):
-            if connection.refused is not None if uri in listed else not keep:
-                self._connections.pop(uri).close()
-        for uri in listed - self._connections.keys():
-            self._connect(uri)
-
-    def close(self) -> None:
-        """Disconnect from all publishers."""
-        self.update(())
-
-    def _connect(self, uri: str) -> None:
-        connection: PublisherConnection = self._connection(
-            uri=uri,
-            on_message=lambda framed: self._on_message(connection, framed),
-            on_refused=lambda text: self._on_refused(connection, text),
-            on_oversized=lambda size: self._oversized(connection, size),
-            number=self._node.next_number(),
-        )
-        self._connections[uri] = connection
-        connection.start()
-
-    def _oversized(self, connection: PublisherConnection, size: int) -> None:
-        if connection.oversized == 1:
-            _log.warning(
-                "! %s: a message of %d bytes of %s is left out: more than %d; shorter ones come [message-too-long]",
-                self.topic,
-                size,
-                connection.uri,
-                limits.TCPROS_MESSAGE_MAX,
-            )

@@ -25,8 +25,7 @@ from rmpa.ros.types.definitions import DefinitionError, MessageError, parse_defi
 from rmpa.ros.types.values import CODES, SIZES, TAGS, TIMES, Written, WrongValueError, encoded, shown
 
 if TYPE_CHECKING:
-    from rmpa.ros.types.definitions import Field, Specification
-    from rmpa.ros.types.messages import MessageType
+    from rmpa.ros.types.definitions import DefinedType, Field, Specification
 
 # Compiled types in the cache of the process; a module has some 50 types. The least recently used is dropped.
 _CODECS_MAX: Final = 512
@@ -265,7 +264,7 @@ class MessageCodec:
         return self._writers[kind]
 
 
-def codec_for(kind: MessageType) -> MessageCodec:
+def codec_for(kind: DefinedType) -> MessageCodec:
     """The codec of a type; the last ``_CODECS_MAX`` are kept. Errors as for ``MessageCodec``."""
     return _codec(kind.name, kind.definition)
 

@@ -69,6 +69,13 @@ class MessageError(RmpaError):
     code = "invalid-message"
 
 
+class DefinedType:
+    """What codecs of a message type are made of: its name and its full text."""
+
+    name: str
+    definition: str
+
+
 @dataclass(frozen=True, slots=True)
 class Field:
     """One field of a message type.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 from rmpa.core.limits import UINT32_MAX
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.definitions import (
+    DefinedType,
     DefinitionError,
     Field,
     MessageError,
@@ -47,7 +48,7 @@ __all__ = ["HeaderNumbers", "MessageError", "MessageType", "Plain", "given_value
 _SEQ: Final = struct.Struct("<I")
 
 
-class MessageType:
+class MessageType(DefinedType):
     """One message type.
 
     Args:
