@@ -42,7 +42,7 @@ async def test_calls_at_each_time_and_arms_itself_again() -> None:
 
 
 async def test_never_tells_a_time_before_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: 50.0 - 1e-9)
+    monkeypatch.setattr(asyncio.get_running_loop(), "time", lambda: 50.0 - 5e-10)
     machine = Machine(50.0)
     timer = MachineTimer(machine.next_timer, machine.handle_timer)
     timer.arm()

@@ -341,7 +341,7 @@ class Mesh:
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
                 await asyncio.sleep(link.backoff.delay())
             else:
-                if link.used:
+                if self.link(link.guid) is link:
                     self._open(sock, link.remote_endpoint, expected=link.guid, lane=Lane.BULK, secured=secured)
                 else:
                     sock.close()  # the link ended meanwhile
