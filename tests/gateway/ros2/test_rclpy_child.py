@@ -19,8 +19,8 @@ from rmpa.gateway.ros2.format import (
     Ros2Endpoint,
     Ros2Node,
     Ros2Qos,
+    gid_of,
 )
-from rmpa.gateway.ros2.graph import gid_of
 from rmpa.gateway.ros2.rclpy_session import RclpySession
 from rmpa.gateway.ros2.ros2 import pythons
 from rmpa.gateway.zenoh.threads import ZenohQos

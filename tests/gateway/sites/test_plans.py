@@ -23,7 +23,7 @@ from rmpa.gateway.sites.keys import (
     SiteSource,
     parse_token,
 )
-from rmpa.gateway.sites.site import SiteExport, SiteExports, SiteImport, SiteImports
+from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
 from rmpa.trust.permissions import Permissions
 from tests.gateway.sites.test_catalogue import every_source
 

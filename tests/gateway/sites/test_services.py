@@ -13,8 +13,8 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, Unreac
 from rmpa.gateway import limits
 from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
+from rmpa.gateway.sites.plans import SiteExport, SiteImport
 from rmpa.gateway.sites.services import ImportedService, SiteActions, SiteServices, asked_type, read_description
-from rmpa.gateway.sites.site import SiteExport, SiteImport
 from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 from tests.gateway.memory_graph import MemoryGraph, MemoryService
 from tests.gateway.memory_zenoh import MemoryZenoh

@@ -12,7 +12,7 @@ from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.keys import MessageSource, SiteModule, SiteSource, token_keys
-from rmpa.gateway.sites.site import SiteImport
+from rmpa.gateway.sites.plans import SiteImport
 from rmpa.gateway.sites.topics import ImportedTopic, SiteTopics
 from rmpa.gateway.zenoh.threads import ZenohQos
 from tests.gateway.memory_graph import MemoryGraph

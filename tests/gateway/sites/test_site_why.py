@@ -19,7 +19,7 @@ from rmpa.gateway import limits
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.sites.answers import SiteAnswers, WhyQuestion, here_stages, parse_ways, sent_stages
 from rmpa.gateway.sites.keys import SiteModule, SiteSource
-from rmpa.gateway.sites.site import SiteImport
+from rmpa.gateway.sites.plans import SiteImport
 from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis

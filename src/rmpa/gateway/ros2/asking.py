@@ -20,8 +20,8 @@ from rosbags.typesys import get_types_from_msg
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import MALFORMED, NoConversion, Ros2Codec
-from rmpa.gateway.ros2.format import EntityKind
-from rmpa.gateway.ros2.graph import SITE, gid_of
+from rmpa.gateway.ros2.format import EntityKind, gid_of
+from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.pairs import described_types
 from rmpa.gateway.ros2.types import Ros2Types, check_size, ros2_fields
 from rmpa.gateway.rules import ForeignSource, SourceKind

@@ -44,6 +44,10 @@ _DOMAIN_MAX: Final = 2**32 - 1
 
 # Bytes of a GID since ROS 2 Jazzy.
 GID_BYTES: Final = 16
+# The namespace of the nodes that gateways declare: ``/rmpa/<module>/<node>``, as in the graphs of ROS 1. No ROS
+# 2 node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no
+# loop.
+OWN_NAMESPACE: Final = "/rmpa/"
 _HEAD: Final = struct.Struct("<qqB")
 _LABELS: Final = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
 _NUMBER: Final = 8
@@ -475,3 +479,10 @@ def _token_number(text: str, largest: int) -> int:
     if text.isascii() and text.isdigit() and len(text) <= len(str(largest)) and int(text) <= largest:
         return int(text)
     raise ValueError(f"{text[:20]!r} is not a number up to {largest}")
+
+
+def gid_of(token: str, size: int = 16) -> bytes:
+    """The GID of an endpoint: the XXH3-128 of its token, the low half first; longer ones have zeros behind."""
+    import xxhash  # noqa: PLC0415 - of the extra "zenoh"
+
+    return int(xxhash.xxh3_128_intdigest(token.encode())).to_bytes(16, "little").ljust(size, b"\0")

@@ -13,7 +13,7 @@ import hashlib
 import struct
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 from uuid import UUID
 
 from rmpa.core.errors import RemoteProtocolError
@@ -24,7 +24,6 @@ from rmpa.gateway.ros2.transcoder import HEAD
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.gateway.ros2.actions import OfferedAction, ShownAction
     from rmpa.gateway.ros2.graph import Query
     from rmpa.gateway.ros2.pairs import ActionPair
     from rmpa.ros.wire.tcpros import Buffer
@@ -277,6 +276,19 @@ class _SentToRos1:
         return self.result is not None
 
 
+class Ros1ServerEffects(Protocol):
+    """What goals at a server of ROS 1 cause."""
+
+    def tell_ros1(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 1."""
+
+    def tell_ros2(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 2."""
+
+    def answer(self, query: Query, response: bytes) -> None:
+        """Answer a request of a client."""
+
+
 class GoalsToRos1:
     """The goals of clients of ROS 2 at a server of ROS 1, without I/O.
 
@@ -286,7 +298,7 @@ class GoalsToRos1:
         clock: The time.
     """
 
-    def __init__(self, action: OfferedAction, pair: ActionPair, clock: SystemClock) -> None:
+    def __init__(self, action: Ros1ServerEffects, pair: ActionPair, clock: SystemClock) -> None:
         self._action = action
         self._pair = pair
         self._clock = clock
@@ -435,10 +447,20 @@ class _SentToRos2:
         return GoalState(self.id, self.status, self.text)
 
 
+class Ros2ServerEffects(Protocol):
+    """What goals at a server of ROS 2 cause."""
+
+    def tell_ros1(self, topic: str, message: bytes) -> None:
+        """Publish a message for ROS 1."""
+
+    def ask(self, service: str, uuid: bytes, request: bytes) -> None:
+        """Call a service of the server; ``answered`` or ``failed`` follows."""
+
+
 class GoalsToRos2:
     """The goals of clients of ROS 1 at a server of ROS 2, without I/O; arguments as for ``GoalsToRos1``."""
 
-    def __init__(self, action: ShownAction, pair: ActionPair, clock: SystemClock) -> None:
+    def __init__(self, action: Ros2ServerEffects, pair: ActionPair, clock: SystemClock) -> None:
         self._action = action
         self._pair = pair
         self._clock = clock

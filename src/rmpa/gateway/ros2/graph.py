@@ -18,11 +18,13 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import (
     NO_HASH,
+    OWN_NAMESPACE,
     USUAL_QOS,
     EntityKind,
     Ros2Attachment,
     Ros2Endpoint,
     Ros2Node,
+    gid_of,
     parse_token,
 )
 from rmpa.gateway.zenoh.threads import first_answer
@@ -90,10 +92,6 @@ def mismatch(own: Ros2Endpoint, other: Ros2Endpoint, distribution: str) -> str:
 # than ``limits`` allow is ignored and counted; so are the tokens of gateways, this one's included.
 
 
-# The namespace of the nodes that gateways declare: ``/rmpa/<module>/<node>``, as in the graphs of ROS 1. No ROS
-# 2 node may use it: one that does is taken for a gateway's, and ignored. So two gateways in one domain make no
-# loop.
-OWN_NAMESPACE: Final = "/rmpa/"
 _OTHER_GATEWAY: Final = "other gateway"
 _NAME: Final = re.compile(r"(/[A-Za-z0-9_]+)+")
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/(msg|srv|action)/[A-Za-z][A-Za-z0-9_]*")
@@ -323,10 +321,3 @@ class OwnRos2Nodes:
         if not self._uses[node.name]:
             del self._uses[node.name]
             self._nodes.pop(node.name)[1].close()
-
-
-def gid_of(token: str, size: int = 16) -> bytes:
-    """The GID of an endpoint: the XXH3-128 of its token, the low half first; longer ones have zeros behind."""
-    import xxhash  # noqa: PLC0415 - of the extra "zenoh"
-
-    return int(xxhash.xxh3_128_intdigest(token.encode())).to_bytes(16, "little").ljust(size, b"\0")

@@ -28,17 +28,18 @@ from rmpa.gateway import limits
 from rmpa.gateway.ros2.format import (
     GID_BYTES,
     NO_HASH,
+    OWN_NAMESPACE,
     EntityKind,
     Ros2Attachment,
     Ros2Endpoint,
     Ros2Node,
     Ros2Qos,
+    gid_of,
     parse_token,
     qos_fields,
     qos_of_fields,
     ros_type,
 )
-from rmpa.gateway.ros2.graph import OWN_NAMESPACE, gid_of
 from rmpa.gateway.zenoh.threads import ZenohSample
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks

@@ -19,10 +19,11 @@ from rmpa.gateway.ros2.format import (
     Ros2Durability,
     Ros2Qos,
     Ros2Reliability,
+    gid_of,
     ros2_qos,
     zenoh_qos,
 )
-from rmpa.gateway.ros2.graph import SITE, gid_of, mismatch, valid_name
+from rmpa.gateway.ros2.graph import SITE, mismatch, valid_name
 from rmpa.gateway.ros2.types import Ros2Sequences
 from rmpa.gateway.rules import ForeignSource, SourceKind
 from rmpa.gateway.topics import ExportedTopic, TopicLimits

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import MeshSource
     from rmpa.gateway.sites.keys import SiteModule, SiteSource
-    from rmpa.gateway.sites.site import SiteExport, SiteImport
+    from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.topics import ExportedTopic
     from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession
     from rmpa.ros.wire.tcpros import Buffer

@@ -24,7 +24,7 @@ from rmpa.gateway.sites.keys import SiteGateway, SiteModule, SiteSource, parse_t
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.sites.site import SiteImports
+    from rmpa.gateway.sites.plans import SiteImports
 
 # Seconds from the end of a token to the end of what it stands for. The tokens of a gateway that was killed go one by
 # one, within some milliseconds: its own may be the last, and then the others are lost and not withdrawn.

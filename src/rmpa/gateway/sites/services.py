@@ -37,7 +37,7 @@ from rmpa.runtime.tasks import OwnedTasks
 if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
     from rmpa.gateway.rules import ForeignSource, MeshSource
-    from rmpa.gateway.sites.site import SiteExport, SiteImport
+    from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.session import ArrivedQuery
     from rmpa.ros.wire.tcpros import Buffer

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.core.statistics import Counters
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules, ForeignSource
-    from rmpa.gateway.sites.site import SiteExport, SiteImport
+    from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
     from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription

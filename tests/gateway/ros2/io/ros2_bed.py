@@ -8,8 +8,7 @@ from typing import Any, cast
 
 from rmpa.config.rules import CrossingRule, GatewaySettings, Ros2Settings
 from rmpa.gateway.ros2.asking import SERVICE_TYPE
-from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, parse_token
-from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, Ros2Endpoint, Ros2Node, Ros2Qos, gid_of, parse_token
 from rmpa.gateway.ros2.ros2 import Ros2Neighbour
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample

@@ -10,8 +10,7 @@ import pytest
 from rmpa.config.rules import Crossing, CrossingRule
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.gateway.ros2 import services
-from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment
-from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.format import EntityKind, Ros2Attachment, gid_of
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.rules import SourceKind
 from rmpa.gateway.zenoh.threads import ZenohSample

@@ -10,8 +10,7 @@ import pytest
 from rmpa.config.rules import Crossing, CrossingRule, Ros2Settings
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import Conversion
-from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos
-from rmpa.gateway.ros2.graph import gid_of
+from rmpa.gateway.ros2.format import NO_HASH, EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos, gid_of
 from rmpa.gateway.ros2.types import Ros2Types
 from rmpa.gateway.zenoh.threads import ZenohQos
 from rmpa.ros.types.messages import MessageType
