@@ -113,8 +113,8 @@ class Types:
     def version(self, name: str, md5sum: str) -> MessageType:
         return self.versions.get(md5sum) or self.message(name)
 
-    def codec(self, message: ReceivedMessage) -> MessageCodec:
-        return codec_for(self.version(message.type, message.md5sum))
+    def codec(self, name: str, md5sum: str) -> MessageCodec:
+        return codec_for(self.version(name, md5sum))
 
     def service(self, name: str) -> ServiceType:
         return ServiceType(name)

@@ -243,7 +243,8 @@ def agent(monkeypatch: pytest.MonkeyPatch) -> Agent:
 def answers_of(rules: NodeRules = EVERYTHING, folder: str = "") -> Answers:
     hub: Any = FakeHub()
     hub.link = SimpleNamespace(rules=rules)
-    answers = Answers(hub, SimpleNamespace(agent=""), {})  # type: ignore[arg-type]
+    none: Any = None
+    answers = Answers(hub, none, none, str, {})
     answers.descriptions = Descriptions(folder, check)
     return answers
 

@@ -211,8 +211,8 @@ async def test_what_is_kept_is_listed_kept_and_removed_by_the_rules(monkeypatch:
     def answers(rules: NodeRules, module: str = "arm") -> Answers:
         hub: Any = FakeHub()
         hub.link = SimpleNamespace(rules=rules)
-        monitor: Any = SimpleNamespace(agent=module)
-        return Answers(hub, monitor, {})
+        none: Any = None
+        return Answers(hub, none, none, lambda: module, {})
 
     asks: Callable[[Answers, str], Any] = lambda one, what: one.answer(what, {"name": HIT, "why": "hit"})  # noqa: E731
     with closing(answers(EVERYTHING)) as free:

@@ -29,6 +29,7 @@ from rmpa.trust.permissions import InviteReply, TrustStatus
 from rmpa.web.hub.hub import Hub
 from rmpa.web.hub.node_link import EVERYTHING, FULL, READ_ONLY, NodeRules, ParamValue, Rights
 from rmpa.web.monitor import questions
+from rmpa.web.monitor.diagnostics import DiagnosticsFeed
 from rmpa.web.monitor.questions import Answers
 from rmpa.web.monitor.resources import ResourceWatch
 from rmpa.web.server.process import CertificateFiles, TokenAccess, WebSetup
@@ -256,8 +257,7 @@ async def ruled(core: RosCore, request: pytest.FixtureRequest) -> AsyncIterator[
 
 
 def answers_of(hub: Hub) -> Answers:
-    monitor: Any = SimpleNamespace(agent="", resources=ResourceWatch(hub))
-    return Answers(hub, monitor, {})
+    return Answers(hub, ResourceWatch(hub), DiagnosticsFeed(hub, lambda: None), str, {})
 
 
 @pytest.mark.parametrize("ruled", [RULED], indirect=True)

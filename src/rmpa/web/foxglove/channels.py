@@ -20,12 +20,12 @@ from rmpa.web.hub.hub import HubClient
 from rmpa.web.hub.node_link import READ_ONLY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.core.errors import RmpaError
     from rmpa.ros.types.installed import ServiceType
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.foxglove.session import FoxgloveSession
+    from rmpa.web.hub.connection import Session
     from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Follower
@@ -143,8 +143,9 @@ class ChannelTable:
         self._hub = hub
         self._with_services = services
         self._client = HubClient(hub, "channels of Foxglove", READ_ONLY)
-        self._sessions: dict[FoxgloveSession, None] = {}
-        self._graph_followers: set[FoxgloveSession] = set()
+        # With what is called when channels have ended.
+        self._sessions: dict[Session, Callable[[Iterable[int]], None]] = {}
+        self._graph_followers: set[Session] = set()
         self._follower: Follower | None = None
         # All that were asked for; ``None``: not known yet.
         self._types: dict[_TypeKey, MessageType | ServiceType | None] = {}
@@ -155,8 +156,8 @@ class ChannelTable:
         self._graph: tuple[_Nodes, _Nodes, _Nodes] = ({}, {}, {})
         hub.types.on_learnt = self._learnt
 
-    def join(self, session: FoxgloveSession) -> None:
-        """Show a client all, and each change from now on."""
+    def join(self, session: Session, withdrawn: Callable[[Iterable[int]], None]) -> None:
+        """Show a client all, and each change from now on; ``withdrawn`` gets the ids of channels that end."""
         if self._follower is None:
             self._follower = self._hub.graph.follow(self._update)
         session.connection.push(
@@ -164,9 +165,9 @@ class ChannelTable:
             *self.services.parted(self.services.by_id.values()),
             *(status(WARNING, text, identity) for identity, text in self._warnings.items()),
         )
-        self._sessions[session] = None
+        self._sessions[session] = withdrawn
 
-    def leave(self, session: FoxgloveSession) -> None:
+    def leave(self, session: Session) -> None:
         """The client has gone."""
         self._sessions.pop(session, None)
         self.unfollow_graph(session)
@@ -174,14 +175,14 @@ class ChannelTable:
             self._follower.close()
             self._follower = None
 
-    def follow_graph(self, session: FoxgloveSession) -> None:
+    def follow_graph(self, session: Session) -> None:
         """Tell a client the graph, as the others know it, and then its changes."""
         if not self._graph_followers:
             self._graph = self._nodes()
         self._graph_followers.add(session)
         session.connection.push(*graph_update(({}, {}, {}), self._graph))
 
-    def unfollow_graph(self, session: FoxgloveSession) -> None:
+    def unfollow_graph(self, session: Session) -> None:
         """Tell it no more of the graph."""
         self._graph_followers.discard(session)
 
@@ -234,8 +235,8 @@ class ChannelTable:
         gone, news = self.channels.update({key: self._types[key[1], False, key[2]] for key in channels})
         _, more = self.services.update({key: self._types[key[1], True, ""] for key in services})
         self._tell(*news, *more)
-        for session in self._sessions if gone else ():
-            session.withdrawn(gone)
+        for withdrawn in self._sessions.values() if gone else ():
+            withdrawn(gone)
         if self._graph_followers:
             before, self._graph = self._graph, self._nodes()
             update = graph_update(before, self._graph)

@@ -121,7 +121,7 @@ class FoxgloveSession(Session):
             "sessionId": self.table.run,
         }
         self.connection.push(message("serverInfo", **about))
-        self.table.join(self)
+        self.table.join(self, self._withdrawn)
         if simulated:
             self.subscribe(CLOCK, CLOCK_TYPE, partial(self.connection.push_message, _Clock(self)), self._tell)
 
@@ -153,7 +153,7 @@ class FoxgloveSession(Session):
         """Send a warning, which a later one of the same subject replaces."""
         self.connection.push(status(WARNING, text, subject))
 
-    def withdrawn(self, channels: Iterable[int]) -> None:
+    def _withdrawn(self, channels: Iterable[int]) -> None:
         """These channels have ended, and their subscriptions with them."""
         gone = {*channels}
         for number, subscription in [*self._subscriptions.items()]:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.node_link import NodeLink
     from rmpa.web.hub.services import ServiceCalls
-    from rmpa.web.hub.topics import ReceivedMessage
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -250,9 +249,9 @@ class TypeLibrary:
         """
         return self._versions.get((name, md5sum)) or self.message(name)
 
-    def codec(self, message: ReceivedMessage) -> MessageCodec:
-        """Converts a message that was received; raises as ``version``."""
-        return codec_for(self.version(message.type, message.md5sum))
+    def codec(self, name: str, md5sum: str) -> MessageCodec:
+        """Converts messages of a version; raises as ``version``."""
+        return codec_for(self.version(name, md5sum))
 
     def service(self, name: str) -> ServiceType:
         """A service type; as ``message``."""

@@ -118,7 +118,11 @@ class Hub:
         Raises:
             RmpaError: Its type is not known, or its bytes are not a message of that type.
         """
-        return self._values.get(message.payload, lambda: self.types.codec(message).views(message.payload))
+
+        def make() -> Any:
+            return self.types.codec(message.type, message.md5sum).views(message.payload)
+
+        return self._values.get(message.payload, make)
 
     def priority(self, topic: str) -> int:
         """The priority of a topic's messages, by its contract: higher ones go first."""

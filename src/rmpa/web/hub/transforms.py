@@ -112,7 +112,7 @@ class TransformTree:
     def take(self, message: ReceivedMessage) -> None:
         """A tf2_msgs/TFMessage, or what has the same bytes; what is broken in it is left out, as tf2 does."""
         try:
-            rows = self._types.codec(message).json_values(message.payload)["transforms"]
+            rows = self._types.codec(message.type, message.md5sum).json_values(message.payload)["transforms"]
         except (RmpaError, KeyError):
             return  # a message of another type
         for row in rows:

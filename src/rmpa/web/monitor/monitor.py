@@ -63,7 +63,8 @@ class Monitor:
         self._wake = asyncio.Event()
         self.resources = ResourceWatch(hub)
         self.diagnostics = DiagnosticsFeed(hub, self.show)
-        self.answers = Answers(hub, self, os.environ if environ is None else environ, folder)
+        environ = os.environ if environ is None else environ
+        self.answers = Answers(hub, self.resources, self.diagnostics, lambda: self.agent, environ, folder)
         self.sticks = Sticks(hub, lambda: self.module)
         self._rates = RatesFeed(lambda: self.answers.ask_agent("rates"))
 

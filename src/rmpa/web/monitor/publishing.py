@@ -13,10 +13,12 @@ from rmpa.ros.types.values import CODES, Written, WrongValueError
 from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.types.messages import MessageType
+    from rmpa.web.hub.connection import Session
     from rmpa.web.hub.topics import ClientPublication
-    from rmpa.web.monitor.session import MonitorSession
 
 _WORDS: Final = ("nan", "inf", "+inf", "-inf")
 
@@ -82,11 +84,23 @@ class PagePublications:
     """The topics of one page.
 
     Args:
-        session: Publishes them, and tells the page.
+        client: Publishes them.
+        send: Sends a message to the page.
+        failed: Tells the page why an order has failed.
+        clock: Monotonic seconds.
     """
 
-    def __init__(self, session: MonitorSession) -> None:
-        self._session = session
+    def __init__(
+        self,
+        client: Session,
+        send: Callable[[dict[str, Any]], None],
+        failed: Callable[[int, RmpaError], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self._client = client
+        self._send = send
+        self._failed = failed
+        self._clock = clock
         # ``None`` while its type is looked for.
         self._repeated: dict[int, _Repeated | None] = {}
 
@@ -109,11 +123,11 @@ class PagePublications:
             try:
                 codec = codec_for(kind)
                 message_of(codec, values, time.time_ns())
-                made = self._session.advertise(topic, type_, functools.partial(self._ended, id_))
+                made = self._client.advertise(topic, type_, functools.partial(self._ended, id_))
             except RmpaError as error:
                 self._ended(id_, error)
                 return
-            now = self._session.clock()
+            now = self._clock()
             each = _Repeated(made, codec, values, 1 / rate if rate else 0.0, now, now)
             self._publish(id_, each, now)
             if rate and id_ in self._repeated:
@@ -121,15 +135,15 @@ class PagePublications:
             else:
                 self.end(id_)
                 made.close()
-            self._session.connection.arm()
+            self._client.connection.arm()
 
-        self._session.run(self._session.hub.types.find_message(type_), found, functools.partial(self._ended, id_))
+        self._client.run(self._client.hub.types.find_message(type_), found, functools.partial(self._ended, id_))
 
     def renew(self, id_: int, now: float) -> None:
         """The page is there, and is told how many messages were published."""
         if (each := self._repeated.get(id_)) is not None:
             each.renewed = now
-            self._session.send({"op": "published", "id": id_, "n": each.count})
+            self._send({"op": "published", "id": id_, "n": each.count})
 
     def end(self, id_: int) -> None:
         """Publish it no more."""
@@ -161,8 +175,8 @@ class PagePublications:
         each.count += 1
         each.next = max(each.next + each.period, now)  # after a pause the missed ones are left out
         if each.count == 1:
-            self._session.send({"op": "published", "id": id_, "n": 1})
+            self._send({"op": "published", "id": id_, "n": 1})
 
     def _ended(self, id_: int, error: RmpaError) -> None:
         self.end(id_)
-        self._session.failed(id_, error)
+        self._failed(id_, error)

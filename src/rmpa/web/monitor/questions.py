@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import ParamValue
-    from rmpa.web.monitor.monitor import Monitor
+    from rmpa.web.monitor.diagnostics import DiagnosticsFeed
+    from rmpa.web.monitor.resources import ResourceWatch
 
 _log = logging.getLogger(__name__)
 
@@ -78,14 +79,26 @@ class Answers:
 
     Args:
         hub: Calls services, and has this module's parameters.
-        monitor: Knows the agent, the Smart Resources and the diagnostics.
+        resources: Knows the Smart Resources.
+        diagnostics: Knows the past of each status.
+        agent: Which agent is asked; empty: the only one.
         environ: Says where the agents' sockets are.
         folder: Where the files that describe this module's resources are; empty for none.
     """
 
-    def __init__(self, hub: Hub, monitor: Monitor, environ: Mapping[str, str], folder: str = "") -> None:
+    def __init__(
+        self,
+        hub: Hub,
+        resources: ResourceWatch,
+        diagnostics: DiagnosticsFeed,
+        agent: Callable[[], str],
+        environ: Mapping[str, str],
+        folder: str = "",
+    ) -> None:
         self._hub = hub
-        self._monitor = monitor
+        self._resources = resources
+        self._diagnostics = diagnostics
+        self._agent_name = agent
         self._environ = environ
         self.descriptions = Descriptions(folder)
         # Each check starts a program: one at a time, and no save between the check and the end of another.
@@ -121,7 +134,7 @@ class Answers:
         return await self.ask_agent("contract", topic=_name(args, "topic"), type_name=_text(args, "type"))
 
     async def _past(self, args: Args) -> Any:
-        return self._monitor.diagnostics.past(_text(args, "status"))
+        return self._diagnostics.past(_text(args, "status"))
 
     async def _graph(self, args: Args) -> Any:
         """The graph of this module's core: each topic with its type and its nodes, proxies included, and services.
@@ -225,7 +238,7 @@ class Answers:
     async def _keep_recording(self, args: Args) -> Any:
         """Keep what the rings of all modules have; why each that cannot does not."""
         why = _text(args, "why")[: limits.LOG_CHARACTERS]
-        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._monitor.agent, time.time_ns())}")
+        self._hub.link.rules.check(Access.RECORD, f"/{recording_id(why, self._agent_name(), time.time_ns())}")
         return await self.ask_agent("record", what="keep", why=why)
 
     async def _remove_recording(self, args: Args) -> Any:
@@ -259,7 +272,7 @@ class Answers:
 
     async def _in_thread(self, do: Callable[[ControlClient], Any]) -> Any:
         def ask() -> Any:
-            agent = choose_agent(self._environ, self._monitor.agent or None)
+            agent = choose_agent(self._environ, self._agent_name() or None)
             with ControlClient(agent.path, observe_limits.CONTROL_HANDLER_TIMEOUT) as client:
                 return do(client)
 
@@ -382,7 +395,7 @@ class Answers:
 
     async def _configure(self, args: Args) -> Any:
         resource, name, value = _name(args, "resource"), _text(args, "name"), args.get("value")
-        facts = self._monitor.resources.facts.get(node_key(_text(args, "peer"), resource))
+        facts = self._resources.facts.get(node_key(_text(args, "peer"), resource))
         known = facts.descriptor.get("parameters", ()) if facts is not None else ()
         kind = next((each["type"] for each in known if each.get("name") == name), None)
         if kind not in _LISTS:

@@ -142,7 +142,7 @@ class MonitorSession(Session):
         self._joystick = Joystick()
         self._driver: Driver | None = None
         self._stick: Stick | None = None
-        self._publications = PagePublications(self)
+        self._publications = PagePublications(self, self.send, self.failed, self.clock)
 
     def opened(self) -> None:
         """Greet the page, and show it the state."""

@@ -100,7 +100,8 @@ class _Topic(ClientStream):
         hub = self._session.hub
 
         def make() -> OutFrame:
-            return encode_message(self.name, message.payload, self._compression, hub.types.codec(message))
+            codec = hub.types.codec(message.type, message.md5sum)
+            return encode_message(self.name, message.payload, self._compression, codec)
 
         return hub.frames.get(message.payload, make, self.name, self._compression)
 

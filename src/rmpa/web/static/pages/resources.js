@@ -236,7 +236,7 @@ function Setting({ value, about, set }) {
   const save = (draft) => {
     const typed = setting(draft, about);
     if (typed.error) return Promise.resolve({ failure: typed });
-    return set(typed.value).then(({ value, failure }) => (failure ? { failure } : { said: value.text }));
+    return set(typed.value).then(({ value: done, failure }) => (failure ? { failure } : { said: done.text }));
   };
   const choices = about.choices?.length ? about.choices.map(String) : about.type === "bool" ? ["true", "false"] : null;
   return html`<${Editable} label=${about.name} ...${{ shown, save, choices }} begin=${written ?? ""} />`;
