@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -198,12 +199,13 @@ async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogC
 
 
 @pytest.fixture
-def bare() -> ResourceNode:
+async def bare() -> AsyncIterator[ResourceNode]:
     one = Resource("bare", role="sensing")
     one.profile(offers={}, name="plain")(lambda: None)
     member = ResourceNode(one, "http://127.0.0.1:1/")
     member.runtime.publish_text = lambda name, text: None  # type: ignore[method-assign]
-    return member
+    yield member
+    await member.tasks.close()
 
 
 @pytest.mark.parametrize("state", LifecycleState)
