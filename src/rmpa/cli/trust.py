@@ -64,7 +64,8 @@ def grouped(digits: str) -> str:
     argument("name"),
     config_option,
 )
-def trust_check(peer: str, what: str, name: str, config: str | None, options: Options) -> int:
+@click.pass_context
+def trust_check(ctx: click.Context, peer: str, what: str, name: str, config: str | None, options: Options) -> None:
     """Say whether the [[permission]] rules of this module let PEER do something here, and which rule decides.
 
     PEER is a module, a site, ros2, or web for the clients of rmpa web. Without --config the rules are those that the
@@ -94,7 +95,7 @@ def trust_check(peer: str, what: str, name: str, config: str | None, options: Op
     options.show({**shown, "groups": permissions.groups_of(peer), "files": files}, text)
     if not files and not options.as_json:
         warn("no rmpa.toml was found here; --config names the file that rmpa up was started with", "doubtful-setting")
-    return 0 if decision.allowed else 1
+    ctx.exit(0 if decision.allowed else 1)
 
 
 @module_verb(option("--label", "TEXT", "A name for the mesh, which its certificates contain.", default=""))
