@@ -211,6 +211,7 @@ class GraphPart(Part, ImportEffects):
             except RemoteProtocolError as error:
                 self.refuse(session, error)
                 return
+            yield
         if isinstance(message, Advertise | AdvertiseServices | SubscriptionChanges):
             if message.added or message.removed:
                 more, less = len(message.added), len(message.removed)
