@@ -179,7 +179,9 @@ async def test_a_listener_that_was_stopped_finds_a_topic_that_was_gone_meanwhile
 @libraries
 async def test_trap_11_a_silent_connection_hurts_no_real_listener(node: Node, ros: Ros, library: str) -> None:
     publisher = await node.advertise("/chatter", BYTES)
-    with socket.create_connection(node.slave.address_of("/chatter")):
+    address = node.slave.address_of("/chatter")
+    assert address is not None
+    with socket.create_connection(address):
         ros.node(library, "listener")
         await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
 
