@@ -260,7 +260,9 @@ class SlaveNode:
             self._refuse("full", client[0], f"too many connections, one from {client[0]} closed")
             sock.close()
             return
-        self._greetings.start(self._greet(sock, client[0]), f"header of a connection to {self.name}")
+        greeting = self._greetings.start(self._greet(sock, client[0]), f"header of a connection to {self.name}")
+        # One that is cancelled before its first step never comes to its own end.
+        greeting.add_done_callback(lambda ended: sock.close() if ended.cancelled() else None)
 
     async def _greet(self, sock: socket.socket, who: str) -> None:
         """Wait for the header of a connection, and pass it to the publication or service that it names."""
