@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, matches_any
-from rmpa.record.format import EVENTS, STATIC, Recorded
+from rmpa.record.format import EVENTS, STATIC, Recorded, RecordedSource
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -26,7 +26,6 @@ from rmpa.runtime.tasks import end_tasks, start_task
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Iterator, Mapping
 
-    from rmpa.record.format import RecordedSource
     from rmpa.record.merge import Timeline
     from rmpa.ros.node.endpoints import Publisher
     from rmpa.ros.node.node import Node

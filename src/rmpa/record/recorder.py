@@ -14,22 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa import client
 from rmpa.bridge.kept import KEPT, REQUESTS, Kept, end_request, read_requests, recording_id, request_keep
-from rmpa.client import (
-    AgentClient,
-    AgentLost,
-    ContractBroken,
-    NoteCleared,
-    NoteRaised,
-    PeerLinked,
-    PeerLost,
-    ServiceAppeared,
-    ServiceGone,
-    TopicAppeared,
-    TopicGone,
-    changes,
-)
-from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST
+from rmpa.config.recording import ALARM, CONTRACT, NODE_DIED, PEER_LOST, RecordSettings
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import is_own, matches_any
 from rmpa.observe.control_client import ControlClient, choose_agent
@@ -43,6 +30,7 @@ from rmpa.record.format import (
     Event,
     ModuleRecord,
     RecordedSource,
+    SegmentWriter,
     event_bytes,
 )
 from rmpa.record.ring import RingThread
@@ -56,10 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from rmpa.client import AgentEvent
-    from rmpa.config.recording import RecordSettings
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.record.format import SegmentWriter
 
 _log = logging.getLogger(__name__)
 _SECOND: Final = 1_000_000_000
@@ -206,15 +191,12 @@ class Recorder:
     async def _follow(self) -> None:
         """Follow the agent: what there is to record, and what happens."""
         read = 0.0
-        async with AgentClient(self._agent) as client:
-            async for now in client.snapshots(period=_PERIOD):
-                if isinstance(now, AgentLost):
+        async with client.AgentClient(self._agent) as agent:
+            async for now in agent.snapshots(period=_PERIOD):
+                if isinstance(now, client.AgentLost):
                     self.happened(Event("agent_lost", now.problem))
                     continue
-                agent = now.agent
-                self._module = ModuleRecord(
-                    name=agent.name, guid=agent.guid, instance=agent.instance, host=agent.host, version=agent.version
-                )
+                self._module = msgspec.convert(now.agent, ModuleRecord, from_attributes=True)
                 self._clocks_epoch = _epoch()
                 self._clocks = {
                     peer.name: msgspec.json.encode(
@@ -280,8 +262,8 @@ class Recorder:
             await asyncio.to_thread(request_keep, self._folder, kept)
 
     def _ask_agent(self, kept: Kept) -> None:
-        with ControlClient(choose_agent(os.environ, self._agent).path) as client:
-            client.call("record", object, what="keep", kept=msgspec.to_builtins(kept))
+        with ControlClient(choose_agent(os.environ, self._agent).path) as agent:
+            agent.call("record", object, what="keep", kept=msgspec.to_builtins(kept))
 
     async def _tend(self) -> None:
         """Do what is requested by files, and write the status."""
@@ -355,7 +337,7 @@ def _events(before: Snapshot | None, after: Snapshot) -> Iterator[Event]:
     """What happened between two snapshots."""
     if before is None:
         return
-    for change in changes(before, after):
+    for change in client.changes(before, after):
         if (event := _event(change)) is not None:
             yield event
     nodes, known, told = _nodes(after), _nodes(before), {one.node for one in before.unreachable}
@@ -373,27 +355,27 @@ def _nodes(snapshot: Snapshot) -> set[str]:
     return {node for node in found if not is_own(node) and not node.startswith("/rmpa_")}  # nodes of our commands
 
 
-def _event(change: AgentEvent) -> Event | None:
+def _event(change: client.AgentEvent) -> Event | None:
     match change:
-        case PeerLost():
+        case client.PeerLost():
             text = f"the link to {change.peer.name} is lost: {change.peer.last_error}"
             return Event(PEER_LOST, text, change.peer.name)
-        case PeerLinked():
+        case client.PeerLinked():
             return Event("peer_linked", f"{change.peer.name} is linked", change.peer.name)
-        case TopicAppeared():
+        case client.TopicAppeared():
             return Event("topic_came", f"{change.topic.name} is there", change.topic.name)
-        case TopicGone():
+        case client.TopicGone():
             return Event("topic_gone", f"{change.topic.name} is gone", change.topic.name)
-        case ServiceAppeared():
+        case client.ServiceAppeared():
             return Event("service_came", f"{change.service.name} is there", change.service.name)
-        case ServiceGone():
+        case client.ServiceGone():
             return Event("service_gone", f"{change.service.name} is gone", change.service.name)
-        case ContractBroken():
+        case client.ContractBroken():
             text = f"{change.topic}: {change.kind.replace('_', ' ')}, {change.count} times ({change.peer})"
             return Event(CONTRACT, text, change.topic, facts={"kind": change.kind, "count": change.count})
-        case NoteRaised():
+        case client.NoteRaised():
             return Event("note", change.text)
-        case NoteCleared():
+        case client.NoteCleared():
             return Event("note_over", change.text)
     return None
 
