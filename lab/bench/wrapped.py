@@ -176,8 +176,7 @@ def _start(shell: Ros) -> None:
 
 def _decide(count: int) -> list[float]:
     """Milliseconds of a decision among ten profiles by five requirements."""
-    from rmpa.resource.decision import Decider
-    from rmpa.resource.declare import Profile
+    from rmpa.resource.decision import Decider, Profile
     from rmpa.resource.quality import MEASURED, QoSRequest
 
     names = ("rate", "latency", "period_sd", "bandwidth", "loss")

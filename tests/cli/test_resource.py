@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import ConfigError
+from rmpa.resource.actuation import read_config
 from rmpa.resource.client import ResourceClient
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least, at_most
-from rmpa.resource.reconfigure import read_config
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
 from rmpa.ros.core.embedded import RosCore

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
+from rmpa.resource.actuation import read_config
 from rmpa.resource.expression import parse_expression
-from rmpa.resource.reconfigure import ChoiceParameter, checked, config, entries, read_config
+from rmpa.resource.reconfigure import ChoiceParameter, checked, config, entries
 from rmpa.resource.resource import Resource
 from rmpa.ros.types.descriptor import CONFIG_TYPE
 from rmpa.ros.types.messages import MessageError, MessageType

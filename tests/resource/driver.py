@@ -8,7 +8,8 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from rmpa.core.errors import RmpaError
-from rmpa.resource.reconfigure import config, read_config
+from rmpa.resource.actuation import read_config
+from rmpa.resource.reconfigure import config
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.endpoints import Publisher
 from rmpa.ros.node.node import Node

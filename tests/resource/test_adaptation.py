@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.adaptation import Adaptation, CoolDown
-from rmpa.resource.decision import AlarmKind, Decider
-from rmpa.resource.declare import AdaptationSettings, Profile
+from rmpa.resource.adaptation import Adaptation, AdaptationSettings, CoolDown
+from rmpa.resource.decision import AlarmKind, Decider, Profile
 from rmpa.resource.quality import MEASURED, Bound, Requirement
 from tests.resource.rig import Action, Apply, Clear, Raise, Reacted, Recorder, bound
 
@@ -81,7 +80,7 @@ def running(rate: float, *profiles: Profile, hard: bool = True) -> Loop:
 def finish(one: Loop, now: float) -> list[Action]:
     done: list[Action] = []
     while one.applying:
-        done += one.applied(one.applying, now)
+        done += one.applied(now)
     return done
 
 
@@ -96,10 +95,10 @@ def alarms(actions: list[Action]) -> list[tuple[AlarmKind, str, str]]:
 def test_a_request_is_translated_into_the_most_similar_profile() -> None:
     one = Loop()
     assert applies(one.reconsider("it starts", 0.0)) == ["slow"]
-    assert one.applied("slow", 0.5) == [Reacted("slow", 0.5)]
+    assert one.applied(0.5) == [Reacted("slow", 0.5)]
     assert applies(one.require(at_least(15), 1.0)) == ["middle"]
     assert (one.profile, one.applying) == ("slow", "middle")
-    assert one.applied("middle", 1.25) == [Reacted("middle", 0.25)]
+    assert one.applied(1.25) == [Reacted("middle", 0.25)]
     assert (one.profile, one.applying) == ("middle", "")
 
 
@@ -123,7 +122,7 @@ def test_a_disturbance_takes_k_of_n_windows() -> None:
     raised = next(a.alarm for a in actions if isinstance(a, Raise))
     assert [(s.attribute, s.offered) for s in raised.shortfalls] == [("rate", 8.0)]
     # From the first window that was violated to the profile that runs.
-    assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
+    assert one.applied(4.5)[0] == Reacted("fast", 2.5)
 
 
 def test_windows_that_were_long_ago_and_what_was_not_asked_do_not_count() -> None:
@@ -178,7 +177,7 @@ def test_infeasible_request_is_non_adaptable_at_once() -> None:
 def test_failed_profile_is_excluded_for_its_cool_down() -> None:
     one = started()
     assert applies(one.require(at_least(15, hard=True), 1.0)) == ["middle"]
-    assert applies(one.failed("middle", "ValueError: no such mode", 1.1)) == ["fast"]
+    assert applies(one.failed("ValueError: no such mode", 1.1)) == ["fast"]
     finish(one, 1.2)
     assert one.explain(2.0)[1].excluded == "ValueError: no such mode"
     assert one.next_timer() == pytest.approx(11.1)
@@ -189,8 +188,8 @@ def test_failed_profile_is_excluded_for_its_cool_down() -> None:
 def test_first_ended_cool_down_retries() -> None:
     one = Loop(FAST, SLOW)
     one.reconsider("it starts", 0.0)
-    assert applies(one.failed("slow", "broken", 1.0)) == ["fast"]
-    assert one.failed("fast", "broken", 2.0) == []
+    assert applies(one.failed("broken", 1.0)) == ["fast"]
+    assert one.failed("broken", 2.0) == []
     assert (one.applying, one.profile) == ("", "")
     assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["slow"]
 
@@ -202,7 +201,7 @@ def test_cool_down_grows_with_each_violation() -> None:
     one.require(at_least(30, hard=True), now)
     for _ in range(6):
         assert one.applying == "fast"
-        one.failed("fast", "broken", now)
+        one.failed("broken", now)
         finish(one, now)
         due = one.next_timer()
         assert due is not None
@@ -249,11 +248,11 @@ def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
 def test_failed_choice_is_retried_after_its_cool_down() -> None:
     one = running(1)
     assert applies(one.pin("fast", 2.0)) == ["fast"]
-    assert applies(one.failed("fast", "broken", 2.0)) == ["slow"]  # not the broken one over and over
+    assert applies(one.failed("broken", 2.0)) == ["slow"]  # not the broken one over and over
     finish(one, 2.0)
     assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["fast"]
     # Who chooses it anew does not wait.
-    one.failed("fast", "broken", 12.0)
+    one.failed("broken", 12.0)
     finish(one, 12.0)
     assert applies(one.pin("fast", 12.5)) == ["fast"]
 
@@ -262,7 +261,7 @@ def test_request_while_applying_counts_afterwards() -> None:
     one = Loop()
     one.reconsider("it starts", 0.0)
     assert one.require(at_least(30), 0.1) == []
-    assert applies(one.applied("slow", 0.2)) == ["fast"]
+    assert applies(one.applied(0.2)) == ["fast"]
 
 
 @pytest.mark.parametrize("seed", range(200))
@@ -300,11 +299,11 @@ def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:
             case 2:
                 take(one.window({"rate": chance.choice((0.5, 4.0, 18.0, 45.0))}, now))
             case 3 if outstanding:
-                was, outstanding = outstanding, ""
-                take(one.applied(was, now))
+                outstanding = ""
+                take(one.applied(now))
             case 4 if outstanding:
-                was, outstanding = outstanding, ""
-                take(one.failed(was, "by chance", now))
+                outstanding = ""
+                take(one.failed("by chance", now))
             case 5:
                 barred = {name: "by chance" for name in ("fast", "middle") if chance.random() < 0.3}
                 take(one.block(barred, now))
@@ -331,7 +330,7 @@ def test_declared_soft_shortfall_is_no_disturbance() -> None:
 def test_restart_continues_with_profile_and_requirements() -> None:
     one = restored([at_least(15)], "fast")  # fast serves as well as middle does
     assert applies(one.reconsider("it starts", 0.0)) == ["fast"]
-    one.applied("fast", 0.1)
+    one.applied(0.1)
     assert one.requirements.keys() == {"/client"}
     assert one.window({"rate": 40.0}, 5.0) == []
     assert applies(one.release("/client", 6.0)) == ["slow"]
@@ -382,7 +381,7 @@ def test_windows_within_the_settling_time_do_not_count() -> None:
 def test_restored_cool_down_runs_to_its_end() -> None:
     one = started()
     one.require(at_least(30), 1.0)
-    assert applies(one.failed("fast", "no bus", 3.0)) == ["middle"]
+    assert applies(one.failed("no bus", 3.0)) == ["middle"]
     cooling = one.cooling(4.0)
     assert {name: (cool.until, cool.cool_down) for name, cool in cooling.items()} == {"fast": (13.0, 10.0)}
     again = restored([at_least(30)], "middle", cooling, 4.0)
@@ -392,7 +391,7 @@ def test_restored_cool_down_runs_to_its_end() -> None:
     assert again.next_timer() == 13.0
     assert not again.cooling(13.0)
     assert applies(again.handle_timer(13.0)) == ["fast"]
-    again.failed("fast", "no bus", 13.5)
+    again.failed("no bus", 13.5)
     assert again.cooling(13.5)["fast"].cool_down == 20.0  # the next one is twice as long, as if nothing had been
 
 

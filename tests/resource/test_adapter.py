@@ -10,12 +10,12 @@ import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource import limits
-from rmpa.resource.adaptation import Adaptation
-from rmpa.resource.adapter import HungError, alarm_values, answer_to, health
+from rmpa.resource.adaptation import Adaptation, AdaptationSettings
+from rmpa.resource.adapter import alarm_values, answer_to, health
 from rmpa.resource.client import ResourceClient
-from rmpa.resource.conditions import Preconditions
-from rmpa.resource.decision import Alarm, AlarmKind, Decider, Shortfall
-from rmpa.resource.declare import AdaptationSettings, Context, Profile
+from rmpa.resource.decision import Alarm, AlarmKind, Decider, Profile, Shortfall
+from rmpa.resource.declare import Context
+from rmpa.resource.functions import HungError, Preconditions
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import MEASURED, Bound, Requirement, at_least, at_most
 from rmpa.resource.resource import Resource
@@ -36,7 +36,7 @@ def decided(*, runs: bool = True, rate: float = 20.0) -> Adaptation:
     one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, [FAST]), AdaptationSettings(), Recorder())
     if runs:
         one.reconsider("it starts", 0.0)
-        one.applied("fast", 0.0)
+        one.applied(0.0)
         one.require(asked(rate), 0.0)
     return one
 
@@ -253,7 +253,7 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
     await member.start()
     loop = member.adapter.adaptation
     windows: list[None] = []
-    watcher = RuntimePart()
+    watcher = RuntimePart(member.runtime)
     watcher.window_ended = lambda *_: windows.append(None)  # type: ignore[method-assign]
     member.runtime.parts.append(watcher)
     member.adapter.enter_context(Context("lab", requires={"noise": at_most("5 cm")}))
@@ -269,10 +269,10 @@ async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: 
 
 async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     applied: list[str] = []
-    watcher = RuntimePart()
-    watcher.changed = lambda: applied.extend(filter(None, [member.adapter.adaptation.applying]))  # type: ignore[method-assign]
     member = ResourceNode(declared(lambda: "the lid is shut"), core.uri)
-    member.parts.append(watcher)
+    watcher = RuntimePart(member.runtime)
+    watcher.changed = lambda: applied.extend(filter(None, [member.adapter.adaptation.applying]))  # type: ignore[method-assign]
+    member.runtime.parts.append(watcher)
     await member.start()
     await until(lambda: applied)
     assert applied[0] == "coarse"
@@ -362,7 +362,7 @@ async def test_a_function_that_hangs_ends_the_resource_with_an_alarm(
 async def test_a_first_profile_that_hangs_ends_the_start(core: RosCore) -> None:
     arm = Arm()
     member = ResourceNode(arm.resource, core.uri)
-    member.adapter.preset = "thread"
+    member.adapter.adaptation.pinned = "thread"
     with pytest.raises(HungError, match="profile thread has not returned within"):
         await member.start()
     assert member.ended.is_set()
@@ -395,8 +395,8 @@ async def test_observed_quality_of_inputs_is_reported(core: RosCore, camera: Res
     one.adaptation(window="200 ms")
     viewer = ResourceNode(one, core.uri)
     await viewer.start()
-    seen = camera.adapter.observed
-    await until(lambda: 20 < float(seen.observed("/viewer", "rate") or 0) < 100)
-    assert float(seen.observed("/viewer", "frames.age") or 0) > 0
-    assert seen.observed("/viewer", "latency") is None  # it did not ask for that
+    seen = camera.adapter.clients
+    await until(lambda: 20 < float(seen["/viewer"].observed.get("rate", 0)) < 100)
+    assert float(seen["/viewer"].observed["frames.age"]) > 0
+    assert "latency" not in seen["/viewer"].observed  # it did not ask for that
     await viewer.close()

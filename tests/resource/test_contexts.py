@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError, PeerRefused
 from rmpa.resource import limits
+from rmpa.resource.actuation import read_config
 from rmpa.resource.expression import Expression, Scalar, parse_expression, split_reference
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.quality import at_least
-from rmpa.resource.reconfigure import DESCRIPTION_TYPE, read_config
+from rmpa.resource.reconfigure import DESCRIPTION_TYPE
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node

@@ -10,8 +10,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decision import Decider, ProfileScore
-from rmpa.resource.declare import Profile
+from rmpa.resource import limits
+from rmpa.resource.adaptation import Adaptation, AdaptationSettings
+from rmpa.resource.decision import Decider, LearntOffer, LearntOffers, OfferSource, Profile, ProfileScore
 from rmpa.resource.quality import (
     MEASURED,
     Attribute,
@@ -30,7 +31,7 @@ from rmpa.resource.quality import (
     parse_requirement,
     quantity,
 )
-from tests.resource.rig import bound
+from tests.resource.rig import Apply, Recorder, bound
 
 RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
 
@@ -229,7 +230,64 @@ def test_ties_go_to_the_one_declared_first(profiles: list[Profile], asked: dict[
     assert decide(plane(twins), asked).profile == decide(plane(profiles), asked).profile
 
 
-RATE, LATENCY = MEASURED["rate"], MEASURED["latency"]
+# --- what was learnt
+
+QUICK, SLOW = Profile("quick", {"rate": 40.0}, cost=1), Profile("slow", {"rate": 20.0}, cost=2)
+WANTED = bound(RATE, at_least=15)
+
+
+def learnt(windows: int, rate: float = 10.0) -> LearntOffers:
+    one = LearntOffers([QUICK, SLOW])
+    for number in range(windows):
+        one.window("quick", {"rate": rate + number % 3 - 1, "latency": 1.0})
+    one.update()
+    return one
+
+
+def test_the_median_and_the_spread_of_the_last_windows_are_kept() -> None:
+    one = learnt(limits.LEARNT_WINDOWS * 2)
+    assert one.offers == {"quick": {"rate": LearntOffer(10.0, 2.0, limits.LEARNT_WINDOWS)}}
+    again = LearntOffers([QUICK])
+    again.restore(one.saved | {"gone": {"rate": [1.0]}})
+    assert again.offers == one.offers
+    assert again.saved == one.saved
+    assert learnt(1).offers["quick"]["rate"] == LearntOffer(9.0, 0.0, 1)
+    word = LearntOffers([Profile("a", {"mode": "low"})])
+    word.window("a", {"mode": "low"})
+    word.update()
+    assert word.offers == {}
+
+
+def test_profiles_are_compared_by_what_was_learnt_if_there_is_enough() -> None:
+    def best(windows: int, *, by_learnt: bool) -> str | None:
+        one = Decider("camera", ATTRIBUTES, [QUICK, SLOW], learnt(windows), by_learnt=by_learnt)
+        found = one.decide({"rate": WANTED})
+        return found.profile if found is not None else None
+
+    enough = limits.LEARNT_LEAST
+    assert (best(enough, by_learnt=False), best(enough - 1, by_learnt=True)) == ("quick", "quick")
+    assert best(enough, by_learnt=True) == "slow"
+    one = Decider("camera", ATTRIBUTES, [QUICK, SLOW], learnt(enough), by_learnt=True)
+    term = one.explain({"rate": WANTED})[0].terms[0]
+    assert (term.offered, term.learnt) == (10.0, LearntOffer(10.0, 1.75, enough))
+    declared = Decider("camera", ATTRIBUTES, [QUICK, SLOW], learnt(enough)).explain({"rate": WANTED})[0].terms[0]
+    assert (declared.offered, declared.learnt) == (40.0, term.learnt)
+
+
+def test_a_change_by_what_was_learnt_says_so() -> None:
+    out = Recorder()
+    decider = Decider("camera", ATTRIBUTES, [QUICK, SLOW], learnt(limits.LEARNT_LEAST), by_learnt=True)
+    one = Adaptation(ATTRIBUTES, decider, AdaptationSettings(offers=OfferSource.LEARNT), out)
+    one.require(Requirement("/a", {"rate": WANTED}), 0.0)
+    assert out.told == [Apply("slow", "/a asks for a quality")]
+    one.applied(0.0)
+    one.pin("quick", 1.0)
+    why = "quick was chosen by hand (learnt: quick has given rate 10 Hz, declared 40 Hz)"
+    assert out.told[-1] == Apply("quick", why)
+
+
+# --- quantities and requests
+
 ZOOM = Attribute("zoom", Direction.TARGET)
 
 

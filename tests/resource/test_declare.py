@@ -14,16 +14,10 @@ import pytest
 import rmpa.resource
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.resource.declaration import Role
-from rmpa.resource.declare import Parameter
+from rmpa.resource.actuation import read_config
+from rmpa.resource.declare import Parameter, Role
 from rmpa.resource.quality import at_least, at_most
-from rmpa.resource.reconfigure import (
-    DESCRIPTION_TYPE,
-    checked,
-    description,
-    entries,
-    read_config,
-)
+from rmpa.resource.reconfigure import DESCRIPTION_TYPE, checked, description, entries
 from rmpa.resource.resource import Resource
 from rmpa.resource.runtime import describe
 from rmpa.ros.node.node import Node

@@ -9,11 +9,9 @@ from typing import Any, Final
 
 import pytest
 
-from rmpa.resource import live
 from rmpa.resource.checking import GraphCheck, Misfit
-from rmpa.resource.describing import Found, describe
+from rmpa.resource.describing import Flow, Found, Knob, LiveGraph, describe, look, started_by
 from rmpa.resource.description import read_description
-from rmpa.resource.live import Flow, Knob, LiveGraph
 from rmpa.resource.node import ResourceNode
 from rmpa.resource.resource import Resource
 from rmpa.ros.core.embedded import RosCore
@@ -128,9 +126,9 @@ def test_a_resource_is_not_named_as_its_node() -> None:
 
 
 def test_a_process_tells_how_it_was_started() -> None:
-    assert live.started_by(os.getpid())["command"]
-    assert live.started_by(os.getpid())["command"][0].endswith(Path(sys.executable).name)
-    assert live.started_by(0) == {}
+    assert started_by(os.getpid())["command"]
+    assert started_by(os.getpid())["command"][0].endswith(Path(sys.executable).name)
+    assert started_by(0) == {}
 
 
 async def test_a_live_node_is_looked_at(core: RosCore, node: Node) -> None:
@@ -145,7 +143,7 @@ async def test_a_live_node_is_looked_at(core: RosCore, node: Node) -> None:
     await one.learn()
     await one.start()
     try:
-        seen = await live.look(
+        seen = await look(
             node,
             topics=["/driver/said"],
             servers=["/driver", "/nothing"],

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -166,7 +167,7 @@ async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogC
     async with Node("ear", master_uri=core.uri) as node, asyncio.timeout(40):
         await node.subscribe("/loud/words", "std_msgs/String", lambda m: words.append(m.message.data))
         await node.subscribe("/loud/mode", "std_msgs/String", lambda m: modes.append(m.message.data))
-        await member.runtime.start(member.parts, member._configure)
+        await member.runtime.start(member._configure)
         while not (member.runtime._publishers["words"].subscribers and member.adapter.adaptation.profile == "plain"):
             await asyncio.sleep(0.01)
         while not member.runtime._publishers["mode"].subscribers:
@@ -198,12 +199,13 @@ async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogC
 
 
 @pytest.fixture
-def bare() -> ResourceNode:
+async def bare() -> AsyncIterator[ResourceNode]:
     one = Resource("bare", role="sensing")
     one.profile(offers={}, name="plain")(lambda: None)
     member = ResourceNode(one, "http://127.0.0.1:1/")
     member.runtime.publish_text = lambda name, text: None  # type: ignore[method-assign]
-    return member
+    yield member
+    await member.tasks.close()
 
 
 @pytest.mark.parametrize("state", LifecycleState)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from rmpa.core.errors import PeerRefused
 from rmpa.resource import limits
@@ -153,7 +154,7 @@ async def test_a_node_that_always_runs_is_started_again_by_its_policy(make: Make
     os.kill(laser, signal.SIGKILL)
     await status(alarms, lambda each: each.level == OK and "over: node /laser runs again" in each.message)
     assert await runs(one, "laser") != laser
-    assert [each.restarts for each in one.processes._nodes.values()] == [1, 0]
+    assert [each.run.restarts for each in one.processes._nodes.values()] == [1, 0]
     os.kill(once, signal.SIGTERM)
     told = await status(alarms, lambda each: "/once" in each.message)
     assert 'is not started again (restart = "never", and it ended in order)' in told.message
@@ -183,7 +184,7 @@ async def test_what_a_killed_run_had_started_is_taken_over_and_ended_in_order(ma
     for each in first.processes._nodes.values():  # as after kill -9: nothing of it acts any more
         assert each._keeper is not None
         each._keeper.cancel()
-        each._mark = each._process = None
+        each.run, each._process = structs.replace(each.run, mark=None), None
     await first.close()
     (tmp_path / "run" / "cam.json").write_bytes(kept)
     assert all(figures(pid) for pid in before.values())

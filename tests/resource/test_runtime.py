@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import pytest
 
-from rmpa.resource.declare import Output
+from rmpa.resource.declare import DeclaredTopic
 from rmpa.resource.node import ResourceNode, run_all
 from rmpa.resource.resource import Resource
-from rmpa.resource.runtime import Runtime, RuntimePart
+from rmpa.resource.runtime import Runtime
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, UnknownTypeError
@@ -29,21 +29,22 @@ def speaker() -> Resource:
     return one
 
 
-class Ear(RuntimePart):
+class Ear:
     """Keeps the outputs on which was published, and the first bytes of each message."""
 
-    def __init__(self) -> None:
+    def __init__(self, runtime: Runtime) -> None:
         self.heard: list[tuple[str, int]] = []
+        runtime.listeners.append(self._hear)
 
-    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
-        self.heard.append((output.name, int.from_bytes(raw[:4], "little")))
+    def _hear(self, topic: DeclaredTopic, raw: bytes, *_: object) -> None:
+        self.heard.append((topic.name, int.from_bytes(raw[:4], "little")))
 
 
 @pytest.fixture
 async def running(core: RosCore, speaker: Resource) -> AsyncIterator[tuple[Runtime, Ear]]:
-    runtime, ear = Runtime(speaker, Node("speaker", master_uri=core.uri)), Ear()
-    await runtime.start([ear])
-    yield runtime, ear
+    runtime = Runtime(speaker, Node("speaker", master_uri=core.uri))
+    await runtime.start()
+    yield runtime, Ear(runtime)
     await runtime.close()
 
 
@@ -83,8 +84,9 @@ async def test_messages_are_held_while_a_profile_is_applied(
 async def test_messages_are_numbered_so_that_losses_are_seen(core: RosCore) -> None:
     nose = Resource("nose", role="sensing")
     smells = nose.output("smells", "sensor_msgs/Range")
-    runtime, ear = Runtime(nose, Node("nose", master_uri=core.uri)), Ear()
-    await runtime.start([ear])
+    runtime = Runtime(nose, Node("nose", master_uri=core.uri))
+    ear = Ear(runtime)
+    await runtime.start()
     try:
         again = smells.type.make({"range": 1.0})
         smells.publish(range=1.0)

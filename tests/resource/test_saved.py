@@ -286,3 +286,22 @@ async def test_storing_is_tried_again(core: RosCore, tmp_path: Path, caplog: pyt
     assert "everything is kept again" in caplog.text
     assert caplog.text.count("nothing is kept: ") == 1
     await member.close()
+
+
+async def test_what_was_learnt_is_kept_over_a_restart(core: RosCore, tmp_path: Path) -> None:
+    def noisy() -> Resource:
+        one = Resource("sonar", role="sensing")
+        noise = one.attribute("noise", better="min", unit="m")
+        one.profile(offers={"noise": 0.01}, name="fine")(lambda: None)
+        one.task(rate=100, name="ping")(lambda: noise.observe(0.25))
+        one.adaptation(window="50 ms", settle=0)
+        return one
+
+    first = await started(core, tmp_path / "sonar.json", noisy())
+    await until(lambda: first.adapter.decision()["learnt"].get("fine", {}).get("noise", {}).get("n", 0) >= 10)
+    assert first.adapter.decision()["learnt"]["fine"]["noise"]["median"] == 0.25
+    kept = len(first.adapter.learnt._windows["fine"]["noise"])
+    await first.close()
+    again = await started(core, tmp_path / "sonar.json", noisy())
+    assert again.adapter.decision()["learnt"]["fine"]["noise"]["n"] >= min(kept, limits.LEARNT_WINDOWS)
+    await again.close()

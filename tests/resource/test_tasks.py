@@ -57,7 +57,8 @@ class Bench(Tasks):
         self.reported: list[str] = []
         self.deactivated: list[str] = []
         self.change = asyncio.Event()
-        runtime: Any = SimpleNamespace(resource=self.resource, node=SimpleNamespace(name="/r"))
+        call = asyncio.get_running_loop().call_soon_threadsafe
+        runtime: Any = SimpleNamespace(resource=self.resource, node=SimpleNamespace(name="/r"), call_in_loop=call)
         super().__init__(runtime, self.deactivated.append)
 
     def begin(self, function: Callable[..., None], **options: Any) -> None:
@@ -244,7 +245,7 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench) -> None
 
     def give(number: int) -> None:
         message: Any = SimpleNamespace(message=f"m{number}", stamp_ns=time.time_ns())
-        bench.received(item, message)
+        bench.heard(item, b"", 0, message)
 
     give(0)
     assert await asyncio.to_thread(first.wait, 30)

@@ -132,20 +132,20 @@ def resource_schema() -> None:
 
 
 async def _misfits(options: Options, resource: Resource, text: str, file: Path, seconds: float) -> list[Misfit]:
-    from rmpa.resource import live
     from rmpa.resource.checking import GraphCheck
+    from rmpa.resource.describing import DESCRIPTIONS, LiveGraph, look
 
     master = options.master()
     graph = await read_graph(master)
     names = {node.name for node in resource.nodes.values()} & set(graph.nodes)
     servers = {node.server or node.name for node in resource.nodes.values()}
-    sources = [source for each in resource.expressions() for source in each.sources.values()]
+    sources = [source for _, each in resource.expressions() for source in each.sources.values()]
 
-    async def body(node: Node) -> live.LiveGraph:
-        return await live.look(
+    async def body(node: Node) -> LiveGraph:
+        return await look(
             node,
             topics=[topic for topic in resource.outputs if topic in graph.publishers],
-            servers=[name for name in servers if f"{name}{live.DESCRIPTIONS}" in graph.publishers],
+            servers=[name for name in servers if f"{name}{DESCRIPTIONS}" in graph.publishers],
             owners=sorted(names),
             diagnostics=any(source.function == "diagnostics" for source in sources),
             seconds=seconds,
@@ -157,8 +157,7 @@ async def _misfits(options: Options, resource: Resource, text: str, file: Path, 
 
 async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
     """Look at the node."""
-    from rmpa.resource import live
-    from rmpa.resource.describing import Found
+    from rmpa.resource.describing import DESCRIPTIONS, DIAGNOSTICS, UPDATES, Found, LiveGraph, look, started_by
 
     master = options.master()
     graph = await read_graph(master)
@@ -166,22 +165,22 @@ async def _found(options: Options, wanted: GraphName, seconds: float) -> Found:
     if name is None:
         raise unknown_name("node", str(wanted), graph.nodes)
     facts = await _facts(graph, master.uri, name)
-    ends = [t.removesuffix(live.DESCRIPTIONS) for t in facts.publications if t.endswith(live.DESCRIPTIONS)]
+    ends = [t.removesuffix(DESCRIPTIONS) for t in facts.publications if t.endswith(DESCRIPTIONS)]
     server = name if name in ends else min(ends, key=len, default="")
-    measured = [t for t in facts.publications if not t.endswith((live.DESCRIPTIONS, live.UPDATES, "/rosout"))]
+    measured = [t for t in facts.publications if not t.endswith((DESCRIPTIONS, UPDATES, "/rosout"))]
 
-    async def body(node: Node) -> live.LiveGraph:
-        return await live.look(
+    async def body(node: Node) -> LiveGraph:
+        return await look(
             node,
             topics=measured,
             servers=[server] if server else [],
             owners=[name],
-            diagnostics=live.DIAGNOSTICS in facts.publications,
+            diagnostics=DIAGNOSTICS in facts.publications,
             seconds=seconds,
         )
 
     seen = await with_node(master, "rmpa_resource", body)
-    started = live.started_by(facts.pid) if facts.pid else {}
+    started = started_by(facts.pid) if facts.pid else {}
     return Found(str(wanted), facts, seen, server, started, seconds)
 
 

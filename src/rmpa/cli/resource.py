@@ -132,7 +132,7 @@ class ResourceGraph:
 
     async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.reconfigure import read_config
+        from rmpa.resource.actuation import read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}

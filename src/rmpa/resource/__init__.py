@@ -12,8 +12,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Final
 
-from rmpa.resource.declaration import Role
-from rmpa.resource.declare import DeclaredAttribute, Demand, Input, Output, Parameter
+from rmpa.resource.declare import DeclaredAttribute, Demand, Input, Output, Parameter, Role
 from rmpa.resource.quality import QoSRequest, RequirementAnswer, at_least, at_most, between, exactly
 from rmpa.resource.resource import Resource
 

@@ -23,26 +23,25 @@ import msgspec
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare import BindingKind
-from rmpa.resource.reconfigure import lists, read_config
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.declare import Binding, BindingKind, Parameter, ParameterValue
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.descriptor import CONFIG_TYPE, SERVICE_TYPE
 from rmpa.ros.types.installed import ServiceType
-from rmpa.ros.types.messages import MessageType
-from rmpa.runtime.tasks import OwnedTasks
+from rmpa.ros.types.messages import MessageType, Plain
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    from collections.abc import Mapping
 
-    from rmpa.resource.declare import Binding, Parameter, ParameterValue, Profile
+    from rmpa.resource.decision import Profile
     from rmpa.resource.processes import Processes
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 _DYNAMIC, _PRIVATE, _ARGUMENT = BindingKind
 # Values of floats that differ by less are the same: nodes convert them.
 _TOLERANCE: Final = 1e-6
+# The type of the values in each list of a ``Config``.
+_LISTS: Final = {"bools": bool, "ints": int, "strs": str, "doubles": float}
 
 
 def same(one: object, other: object) -> bool:
@@ -59,6 +58,30 @@ def _fit(value: ParameterValue, present: ParameterValue) -> ParameterValue:
     return type(present)(value)
 
 
+def lists(values: Mapping[str, ParameterValue]) -> dict[str, Plain]:
+    """Make the plain values of a ``Config`` that asks a server for some values; the others stay."""
+    return {
+        key: [{"name": name, "value": value} for name, value in values.items() if type(value) is kind]
+        for key, kind in _LISTS.items()
+    }
+
+
+def read_config(message: Any) -> dict[str, ParameterValue]:
+    """The values of a ``Config`` message by parameter; groups are ignored, since there is only one.
+
+    Raises:
+        ConfigError: The message has a parameter twice.
+    """
+    found: dict[str, ParameterValue] = {}
+    for key, kind in _LISTS.items():
+        for pair in getattr(message, key):
+            name = str(pair.name)
+            if name in found:
+                raise ConfigError(f"parameter {name[:80]}", "it is given twice", "say it once")
+            found[name] = kind(pair.value)
+    return found
+
+
 class Actuation(RuntimePart):
     """The bound parameters of one resource, and the nodes that profiles need; must be started before the adapter.
 
@@ -69,14 +92,12 @@ class Actuation(RuntimePart):
 
     # More than 12 fields: what is wanted, and what is known of the nodes.
     def __init__(self, runtime: Runtime, processes: Processes) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
         self._processes = processes
         parameters, nodes = runtime.resource.parameters, runtime.resource.nodes
         self._bound = runtime.resource.bound
         # Values that people set, by parameter; may be set before ``start``.
-        self.by_hand: dict[str, ParameterValue] = {}
-        # Called after a value by hand has come or gone.
-        self.on_change: Callable[[], None] = lambda: None
+        self.by_hand = {name: parameters[name].value for name in self._bound if parameters[name].given}
         # The parameters that some profile sets.
         self._profiled = {name for one in runtime.resource.profiles.values() for name in one.sets}
         # What the profile that runs sets.
@@ -99,7 +120,6 @@ class Actuation(RuntimePart):
         self._fresh: set[str] = set()
         self._judging: set[str] = set()
         self._lock = asyncio.Lock()
-        self._work = OwnedTasks()
 
     async def start(self) -> None:
         """Follow the values of the nodes."""
@@ -120,10 +140,6 @@ class Actuation(RuntimePart):
                 value: Any = await node.get_param(place, default=None)
                 if isinstance(value, bool | int | float | str):
                     self._known[name] = value
-
-    async def close(self) -> None:
-        """Follow nothing any more; the nodes keep their values."""
-        await self._work.close()
 
     async def apply(self, profile: Profile) -> None:
         """Have the profile's nodes run, then set its values, except those by hand.
@@ -196,7 +212,9 @@ class Actuation(RuntimePart):
         nodes: dict[str, dict[str, ParameterValue]] = {}
         for name, value in values.items():
             nodes.setdefault(self._bound[name].node, {})[name] = value
-        await _all(self._read(key) for key in nodes)
+        for outcome in await asyncio.gather(*map(self._read, nodes), return_exceptions=True):
+            if isinstance(outcome, BaseException):
+                raise outcome
         parameters = self._runtime.resource.parameters
         defaults = {name: parameters[name].default for name, one in self._bound.items() if one.kind is _ARGUMENT}
         before = defaults | self._known
@@ -336,21 +354,22 @@ class Actuation(RuntimePart):
             self._judging.add(key)
             self._work.start(self._judge(key), f"configuration of {key}")
 
-    async def _greet(self, key: str) -> None:
-        async with self._lock:
-            await self._take(key)
-
     async def _judge(self, key: str) -> None:
-        loop = asyncio.get_running_loop()
+        """Take over what an operator has changed, when the node is quiet."""
+        loop, quiet = asyncio.get_running_loop(), limits.KNOB_QUIET
         while True:
-            await asyncio.sleep(limits.KNOB_QUIET)
+            await asyncio.sleep(quiet)
             async with self._lock:
-                if loop.time() - self._touched[key] >= limits.KNOB_QUIET * 0.9:
+                if loop.time() - self._touched[key] >= quiet * 0.9:
                     self._judging.discard(key)
-                    await self._take(key)
+                    await self._take_over(key)
                     return
 
-    async def _take(self, key: str) -> None:
+    async def _greet(self, key: str) -> None:
+        async with self._lock:
+            await self._take_over(key)
+
+    async def _take_over(self, key: str) -> None:
         """Take over what has changed at a node, or give a node that is new what is wanted of it."""
         config, fresh = self._configs[key], key in self._fresh
         self._fresh.discard(key)
@@ -396,11 +415,4 @@ class Actuation(RuntimePart):
         if not same(before, self.by_hand.get(name)):
             text = f"{value} by hand; profiles leave it alone" if name in self.by_hand else "no longer by hand"
             _log.info("= %s: parameter %s: %s", self._runtime.node.name, name, text)
-            self.on_change()
-
-
-async def _all(work: Iterable[Awaitable[None]]) -> None:
-    """Wait for all, then raise the first error."""
-    for outcome in await asyncio.gather(*work, return_exceptions=True):
-        if isinstance(outcome, BaseException):
-            raise outcome
+            self._runtime.changed()

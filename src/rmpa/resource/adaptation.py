@@ -22,20 +22,68 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
-from rmpa.resource.decision import Alarm, AlarmKind, Shortfall, find_shortfalls
-from rmpa.resource.quality import merge
+from rmpa.core.errors import ConfigError
+from rmpa.resource.decision import Alarm, AlarmKind, Decider, OfferSource, ProfileScore, Shortfall, find_shortfalls
+from rmpa.resource.quality import Attribute, Bound, Requirement, Value, merge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from rmpa.resource.decision import Decider, ProfileScore
-    from rmpa.resource.declare import AdaptationSettings
-    from rmpa.resource.quality import Attribute, Bound, Requirement, Value
 
 # Factor by which each cool-down of a profile is longer than the one before, up to ``cool_down_max``.
 COOL_DOWN_GROWTH: Final = 2.0
+
+
+# The least value in seconds of each time of the control loop, and the greatest of all.
+_LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, "apply_timeout": 0.01}
+_DAY: Final = 86400
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptationSettings:
+    """Parameters of the control loop.
+
+    Args:
+        violations: ``k``: the number of violated windows among the last ``windows`` that is a disturbance.
+        windows: ``n``: the number of last windows that are considered.
+        improvement: ``h``: hysteresis; a change without a disturbance must reduce the distance by more than this.
+        window: Length of a quality window, in seconds.
+        dwell: Least number of seconds that a profile runs before a change without a disturbance.
+        settle: Settling time: windows that begin within so many seconds of a change are not judged, because messages
+            that were queued under the previous profile still arrive.
+        cool_down: Seconds for which a profile is excluded after it failed or was violated.
+        cool_down_max: The longest cool-down; it doubles with each further failure.
+        apply_timeout: Seconds after which a profile that is being applied counts as hung.
+        offers: Whether profiles are compared by what their author declared, or by what they have given (``learnt``).
+    """
+
+    violations: int = 2
+    windows: int = 3
+    improvement: float = 0.05
+    window: float = 1.0
+    dwell: float = 2.0
+    settle: float = 1.0
+    cool_down: float = 10.0
+    cool_down_max: float = 160.0
+    apply_timeout: float = 5.0
+    offers: OfferSource = OfferSource.DECLARED
+
+    def check(self, where: str) -> None:
+        """Check the numbers of windows and the times.
+
+        Raises:
+            ConfigError: One is out of range, or ``violations`` is greater than ``windows``.
+        """
+        if not 1 <= self.violations <= self.windows <= 100:
+            problem = f"{self.violations} of {self.windows} windows"
+            raise ConfigError(where, problem, "1 <= violations <= windows <= 100")
+        for name, least in _LEAST.items():
+            seconds = getattr(self, name)
+            if not least <= seconds <= _DAY:
+                raise ConfigError(where, f"{name} is {seconds:g} s", f"at least {least:g} s, at most a day")
 
 
 class CoolDown(NamedTuple):
@@ -92,7 +140,7 @@ class Adaptation:
         self.profile = ""
         # The profile that is being applied; empty: none.
         self.applying = ""
-        # The profile that was chosen by hand; empty: the loop decides.
+        # The profile that was chosen by hand; empty: the loop decides. May be set before the first choice.
         self.pinned = ""
         # The alarm that is raised at present.
         self.alarm: Alarm | None = None
@@ -226,35 +274,28 @@ class Adaptation:
             self.begin_cool_down(self.profile, why, now)
             self._apply(effort.profile, "none can serve: best effort", since)
 
-    def applied(self, profile: str, now: float) -> None:
-        """Report that the profile has been applied; ignored unless it is the one that is being applied."""
-        if not profile or profile != self.applying:
-            return
-        self.profile, self.applying = profile, ""
+    def applied(self, now: float) -> None:
+        """Report that the profile that was being applied is in force."""
+        self.profile, self.applying = self.applying, ""
         self._active_since = now
         self._windows.clear()
         reaction, self._cause = max(0.0, now - self._cause), math.inf
-        self._out.reacted(profile, reaction)
+        self._out.reacted(self.profile, reaction)
         at_once, self._replan_at_once = self._replan_at_once, False
         self._plan(now, "what is asked has changed meanwhile", at_once=at_once)
 
-    def failed(self, profile: str, why: str, now: float) -> None:
-        """Report that the profile could not be applied; the next best profile is applied instead.
-
-        The report is ignored unless the profile is the one that is being applied.
-        """
-        if not profile or profile != self.applying:
-            return
+    def failed(self, why: str, now: float) -> None:
+        """Report that the profile could not be applied; the next best profile is applied instead."""
+        profile, self.applying = self.applying, ""
         self.begin_cool_down(profile, why, now)
-        self.applying = ""
         # The failed profile may be partly in force, so even the profile that ran before is applied again.
         self._plan(now, f"{profile} failed: {why}", again=True)
 
-    def broken(self, profile: str, why: str, now: float) -> None:
+    def broken(self, why: str, now: float) -> None:
         """Report that the running profile does not work any more; the next best profile is applied instead."""
-        if profile and profile == self.profile and not self.applying:
-            self.begin_cool_down(profile, why, now)
-            self._plan(now, f"{profile} does not work any more: {why}", at_once=True)
+        if not self.applying:
+            self.begin_cool_down(self.profile, why, now)
+            self._plan(now, f"{self.profile} does not work any more: {why}", at_once=True)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due; ``None``: no timer runs."""

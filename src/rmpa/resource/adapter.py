@@ -7,7 +7,6 @@ in any module can use them. ``resource.adaptation`` makes the decisions.
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 import time
 from collections import deque
@@ -19,36 +18,27 @@ from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import Adaptation
-from rmpa.resource.conditions import Preconditions, Rules
-from rmpa.resource.decision import AlarmKind, Decider
-from rmpa.resource.declare import OfferSource
-from rmpa.resource.learnt import LearntOffers
-from rmpa.resource.measuring import ObservedQualities, QualityMeasurement, count_missing
-from rmpa.resource.quality import Requirement
-from rmpa.resource.runtime import CALLER, RuntimePart
+from rmpa.resource.decision import Alarm, AlarmKind, Decider, LearntOffers, OfferSource
+from rmpa.resource.functions import HungError, Preconditions, call_function
+from rmpa.resource.measuring import Measuring, count_missing
+from rmpa.resource.quality import Attribute, Bound, Requirement, Value
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.resource.saved import Clients, SavedState
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
 from rmpa.ros.types.descriptor import LEVEL_FOR
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import LENGTH, printable
-from rmpa.runtime.accept import in_thread
 from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.tasks import end_tasks, start_task
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.resource.actuation import Actuation
-    from rmpa.resource.decision import Alarm
-    from rmpa.resource.declare import Context, Hook, Input, ManagedNode, Output
-    from rmpa.resource.observing import Observing
-    from rmpa.resource.processes import Processes
-    from rmpa.resource.quality import Attribute, Bound, Value
-    from rmpa.resource.runtime import Runtime
+    from rmpa.resource.declare import AlarmRule, Context, ManagedNode
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
-    from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
-    from rmpa.ros.wire.slave_api import Sent
+    from rmpa.ros.node.endpoints import Publisher, Received
 
 _log = logging.getLogger(__name__)
 # The longest time in seconds between two looks whether a profile has been applied.
@@ -59,49 +49,6 @@ _CLIENTS_INTERVAL: Final = 0.25
 _CONTEXT_PRIORITY: Final = 1 << 30
 # Prefix of the client name under which a context's requirement is kept.
 _CONTEXT_CLIENT: Final = "context "
-
-
-class HungError(RmpaError):
-    """A function of a profile or context has not returned within its time-out; the resource ends."""
-
-    code = "resource-trouble"
-
-
-async def call_function(function: Hook, what: str, name: str, limit: float, remedy: str) -> None:
-    """Call a function of a profile or context: a coroutine function in the event loop, a plain one in a thread.
-
-    A thread cannot be stopped from outside, so a plain function that exceeds its time-out goes on until the process
-    ends.
-
-    Args:
-        function: The function.
-        what: ``profile`` or ``context``.
-        name: Name of the profile or context.
-        limit: The time-out in seconds.
-        remedy: What to do if the function exceeds it.
-
-    Raises:
-        HungError: The function has exceeded its time-out.
-        Exception: As raised by the function.
-    """
-
-    async def run() -> None:
-        CALLER.set(what)
-        outcome = function() if inspect.iscoroutinefunction(function) else await in_thread(function, f"{what} {name}")
-        if outcome is not None:
-            await outcome
-
-    call = start_task(run(), f"{what} {name}", raises=(Exception,))
-    try:
-        await asyncio.wait([call], timeout=limit)
-    finally:
-        call.cancel()
-    if not call.done():
-        text = f"the function of {what} {name} has not returned within {limit:g} s; the resource ends"
-        raise HungError(f"{text}; {remedy}")
-    if call.cancelled():
-        raise RuntimeError("CancelledError: something that it awaited was cancelled")
-    call.result()
 
 
 def alarm_values(
@@ -173,30 +120,29 @@ class Adapter(RuntimePart):
 
     Args:
         runtime: The runtime of the resource.
-        values: The values of attributes that have an expression.
+        values: What rules refer to, and the values of attributes that have an expression.
         tasks: The resource's tasks, paused while a profile is applied.
         actuation: Applies a profile to other nodes.
-        observing: Measures what other nodes publish.
+        measuring: Measures the resource.
         stop: Set when a function of a profile or context has exceeded its time-out: the resource has to end.
     """
 
+    # More than 12 fields: what it drives, and what is published of it.
     def __init__(
         self,
         runtime: Runtime,
         values: ExpressionValues,
         tasks: Tasks,
         actuation: Actuation,
-        observing: Observing,
+        measuring: Measuring,
         stop: asyncio.Event,
     ) -> None:
+        super().__init__(runtime)
         resource = runtime.resource
-        self._runtime = runtime
         self._values = values
         self._tasks = tasks
         self._actuation = actuation
-        actuation.on_change = self._tell
-        self._observing = observing
-        observing.on_counts = self._counted
+        self._measuring = measuring
         self._stop = stop
         self._name = runtime.node.name
         self._attributes = resource.attributes
@@ -206,58 +152,48 @@ class Adapter(RuntimePart):
         self.learnt = LearntOffers(profiles)
         decider = Decider(resource.name, self._attributes, profiles, self.learnt, by_learnt=by_learnt)
         self.adaptation = Adaptation(self._attributes, decider, self._settings, self)
-        self.clients = Clients(resource.name, self._attributes)
+        self.clients = Clients(resource.name, self._attributes, 3 * self._settings.window)
         # The state that was saved before a restart.
         self.saved = SavedState()
-        # The profile chosen by hand before ``start``; empty: the loop decides.
-        self.preset = ""
         # Seconds that the last reconfiguration took, from its cause to its completion; ``None`` before the first.
         self.reaction: float | None = None
         # The function for which the resource ends; ``None``: none hangs.
         self.hung: HungError | None = None
-        self.observed = ObservedQualities(self._attributes, resource.name, 3 * self._settings.window)
         # The attributes whose values the resource's own nodes say.
         self._said = {n: one for n, one in resource.declared_attributes.items() if one.value is None}
-        # ``None`` before the start.
-        self._measuring: QualityMeasurement | None = None
         self._measured: dict[str, Value] = {}
         self._missing: dict[str, int] = {}
-        self._rules = Rules(resource, values)
+        # The alarms by rules that stand.
+        self._standing: dict[str, AlarmRule] = {}
         # The last decisions, the newest last, as they are told; and the one that is being applied.
         self._history: deque[dict[str, Any]] = deque(maxlen=limits.DECISIONS_KEPT)
         self._deciding: dict[str, Any] = {}
         self._preconditions = Preconditions(resource.profiles)
-        self._blocked_by_needs: dict[str, str] = {}
-        self._blocked_by_context: dict[str, str] = {}
+        self._blocked: dict[str, str] = {}
         self._checking: asyncio.Task[None] | None = None
         self._applying: asyncio.Task[None] | None = None
-        self._requirements: Subscriber | None = None
         self.publishers: dict[str, Publisher] = {}
         self._responses: list[bytes] | None = None
         # The level of ``quality``, and since when, in monotonic seconds.
         self._level: tuple[DiagnosticLevel, float] | None = None
         self._window_end: float | None = None
-        self._clients_check: float | None = None
         self._timers = (
             MachineTimer(self.adaptation.next_timer, self._handle_timer),
             MachineTimer(lambda: self._window_end, self._end_window),
-            MachineTimer(lambda: self._clients_check, self._check_clients),
         )
-        self._closed = False
-        # The part that runs the nodes that profiles name; ``None``: there are none.
-        self.processes: Processes | None = None
+        # True before ``start`` and after ``close``.
+        self._closed = True
 
     async def start(self) -> None:
-        """Begin to measure, choose the first profile, and serve clients."""
-        self._loop = asyncio.get_running_loop()
-        self._blocked_by_needs = await self._preconditions.check()
+        """Choose the first profile, and serve clients."""
+        self._loop, self._closed = asyncio.get_running_loop(), False
+        self._blocked = await self._preconditions.check()
         node, kind = self._runtime.node, MessageType(ARRAY_TYPE)
         for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
             self.publishers[name] = await node.advertise(f"{node.name}/{name}", kind, latch=latch)
         self.publishers["diagnostics"] = await node.advertise("/diagnostics", kind)
         now, now_ns = self._loop.time(), time.time_ns()
-        self._measuring = QualityMeasurement(self._runtime.resource, now)
-        self._runtime.on_observation = self._measuring.observe
+        self._measuring.quality.restart(now)
         requirements = self.clients.restore(self.saved.requirements, now, now_ns)
         left = {name: one.left(now, now_ns) for name, one in self.saved.cool_downs.items()}
         cool_downs = {name: one for name, one in left.items() if one is not None}
@@ -265,15 +201,16 @@ class Adapter(RuntimePart):
         self.adaptation.restore(requirements, self.saved.last, cool_downs, now)
         self._requirements = await node.subscribe(f"{node.name}/requirements", kind, self._requirement_received)
         await node.subscribe(f"{node.name}/observed", kind, self._observation_received)
-        if self._runtime.resource.nodes and any(one.value is None for one in self._said.values()):
+        if self._runtime.resource.nodes and self._said:
             await node.subscribe(f"{node.name}/attributes", kind, self._attribute_received)
         self._update_blocked()
-        if self.preset:
-            self.adaptation.pin(self.preset, now, restored=True)
+        if chosen := self.adaptation.pinned:
+            self.adaptation.pin(chosen, now, restored=True)
         else:
             self.adaptation.reconsider("the resource starts", now)
-        self._window_end, self._clients_check = now + self._settings.window, now + _CLIENTS_INTERVAL
-        self._tell()
+        self._window_end = now + self._settings.window
+        self._work.add(keep_task(self._watch_clients, "look for clients"))
+        self._runtime.changed()
 
     async def close(self) -> None:
         """Stop all decisions and reports; a profile that is being applied is given up."""
@@ -281,81 +218,69 @@ class Adapter(RuntimePart):
         for timer in self._timers:
             timer.close()
         self.publishers.clear()
-        await end_tasks(self._checking, self._applying)
+        await super().close()
         await self._preconditions.close()
-
-    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
-        """Measure a message that an output has sent."""
-        if self._measuring is not None:
-            self._measuring.message(output.name, raw, self._loop.time(), now_ns, caller)
-
-    def _counted(self, output: str, sent: Mapping[str, Sent], now: float) -> None:
-        if self._measuring is not None:
-            self._measuring.counted(output, sent, now)
-
-    def received(self, item: Input, message: Received) -> None:
-        """Measure a message that an input has received."""
-        if self._measuring is not None:
-            self._measuring.message(item.name, message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
 
     def _end_window(self, now: float) -> None:
         # Counted from the due time, not from now, so that lateness does not add up.
         self._window_end = max((self._window_end or now) + self._settings.window, now)
-        measured = self._values.derive(self._measuring.window(now) if self._measuring is not None else {})
-        self._measured = self.observed.worst(measured, self.adaptation.requirements, now)
+        measured = self._values.derive(self._measuring.quality.window(now))
+        self._measured = self.clients.worst(measured, self.adaptation.requirements, now)
         lacks = self._runtime.problems()[0]
         for text, missing in count_missing(self._missing, lacks):
-            message = text if missing else f"over: {text}"
-            self._log_change(message, over=not missing)
-            level = DiagnosticLevel.STALE if missing else DiagnosticLevel.OK
-            self._report("alarms", level, message, {"cleared": str(not missing).lower()})
+            self._report_alarm(DiagnosticLevel.STALE, text, {}, over=not missing)
         self._judge_alarms()
         if self._checking is None or self._checking.done():
-            self._checking = start_task(self._check_preconditions(), "check preconditions")
+            self._checking = self._work.start(self._check_preconditions(), "check preconditions")
         profile = self.adaptation.profile
         if self.adaptation.window(self._measured, now) and not lacks:  # what is missing tells nothing of the profile
             self.learnt.window(profile, self._measured)
         for part in self._runtime.parts:
             part.window_ended(self._measured)
         self._report_quality(now)
-        self._tell()
+        self._runtime.changed()
 
     def _judge_alarms(self) -> None:
-        for alarm, raised in self._rules.judge():
-            text = alarm.text or f"alarm {alarm.name}: {alarm.when}"
+        """Raise the alarms whose rules are true now, and clear others; one whose rule is unknown stays as it is."""
+        values = self._values.now()
+        for alarm in self._runtime.resource.alarms.values():
+            holds, stands = alarm.when.holds(values), alarm.name in self._standing
+            if holds is None or holds == stands:
+                continue
+            if holds:
+                self._standing[alarm.name] = alarm
+            else:
+                del self._standing[alarm.name]
             level = DiagnosticLevel.ERROR if alarm.error else DiagnosticLevel.WARN
-            message = text if raised else f"over: {text}"
-            self._log_change(message, over=not raised)
-            values = {"alarm": alarm.name, "rule": alarm.when, "cleared": str(not raised).lower()}
-            self._report("alarms", level if raised else DiagnosticLevel.OK, message, values)
+            facts = {"alarm": alarm.name, "rule": str(alarm.when)}
+            self._report_alarm(level, str(alarm), facts, over=not holds)
 
     async def _check_preconditions(self) -> None:
-        self._blocked_by_needs = await self._preconditions.check()
+        self._blocked = await self._preconditions.check()
         self._update_blocked()
-        self._tell()
+        self._runtime.changed()
 
     def _update_blocked(self) -> None:
-        """Block profiles whose preconditions, rules or nodes are not as they need, and those out of the context."""
-        by_nodes = self._observing.blocked() | (self.processes.blocked() if self.processes is not None else {})
-        blocked = by_nodes | self._rules.blocked() | self._blocked_by_needs | self._blocked_by_context
+        blocked = {name: why for part in self._runtime.parts for name, why in part.blocked().items()}
         self.adaptation.block(blocked, self._loop.time())
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles whose preconditions do not hold."""
+        return self._blocked
 
     def node_changed(self, node: ManagedNode, text: str, ended: bool) -> None:
         """Report that a node has ended, or runs again; the running profile has failed if it names one that ended."""
-        self._log_change(text, over=not ended)
-        level, profile = DiagnosticLevel.WARN if ended else DiagnosticLevel.OK, self.adaptation.profile
-        values = {"node": node.name, "cleared": str(not ended).lower()}
-        self._report("alarms", level, text if ended else f"over: {text}", values)
-        if ended and profile and node.key in self._runtime.resource.profiles[profile].nodes:
-            self.adaptation.broken(profile, text, self._loop.time())
-        self._tell()
+        self._report_alarm(DiagnosticLevel.WARN, text, {"node": node.name}, over=not ended)
+        running = self._runtime.resource.profiles.get(self.adaptation.profile)
+        if ended and running is not None and node.key in running.nodes:
+            self.adaptation.broken(text, self._loop.time())
+        self._runtime.changed()
 
     def _observation_received(self, message: Received) -> None:
         try:
-            self.observed.report(message.caller_id, _pairs(message), self._loop.time())
+            self.clients.report(message.caller_id, _pairs(message), self._loop.time())
         except ConfigError as error:
-            if self.clients[message.caller_id].refusal != str(error):  # reports repeat; one error is logged once
-                self.refuse(message.caller_id, str(error))
+            self._refuse_once(message.caller_id, str(error))
 
     def _attribute_received(self, message: Received) -> None:
         """Take what a node of the resource says of attributes."""
@@ -371,8 +296,8 @@ class Adapter(RuntimePart):
                 declared.observe(declared.attribute.parse(text, name))
             except ConfigError as error:
                 problem = str(error)
-        if problem and self.clients[message.caller_id].refusal != problem:  # they repeat; one error is logged once
-            self.refuse(message.caller_id, problem)
+        if problem:
+            self._refuse_once(message.caller_id, problem)
 
     def _requirement_received(self, message: Received) -> None:
         client, stamp, now = message.caller_id, message.message.header.stamp, self._loop.time()
@@ -387,33 +312,38 @@ class Adapter(RuntimePart):
             self.adaptation.require(requirement, now)
         elif requirement is not None:
             self.adaptation.release(client, now)
-        self._tell()
+        self._runtime.changed()
+
+    def _refuse_once(self, client: str, text: str) -> None:
+        """Refuse one of messages that repeat: an error that is told already is not told again."""
+        if self.clients[client].refusal != text:
+            self.refuse(client, text)
 
     def refuse(self, client: str, text: str) -> None:
         """Publish a response that the client's last message is invalid; ``text`` is the reason."""
         _log.warning("! %s: %s: %s [resource-trouble]", self._name, printable(client), text)
         self.clients.refuse(client, text)
-        self._tell()
+        self._runtime.changed()
 
-    def _check_clients(self, now: float) -> None:
-        self._clients_check = now + _CLIENTS_INTERVAL
-        connected = self._requirements.callers if self._requirements is not None else set()
-        for client in self.clients.remove_absent(connected, now):
-            if client in self.adaptation.requirements:
-                _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
-            self.adaptation.release(client, now)
-            self._tell()
+    async def _watch_clients(self) -> None:
+        """Release what clients have asked for that are gone."""
+        while True:
+            await asyncio.sleep(_CLIENTS_INTERVAL)
+            now = self._loop.time()
+            for client in self.clients.remove_absent(self._requirements.callers, now):
+                if client in self.adaptation.requirements:
+                    _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
+                self.adaptation.release(client, now)
+                self._runtime.changed()
 
     def enter_context(self, context: Context) -> None:
-        """Put a context's requirement in force, above those of clients, and block the profiles that it excludes.
+        """Put a context's requirement in force, above those of clients.
 
         Args:
             context: The context; one without a name: no context.
         """
         now, name = self._loop.time(), f"{_CONTEXT_CLIENT}{context.name}"
         before = [client for client in self.adaptation.requirements if client.startswith(_CONTEXT_CLIENT)]
-        barred = set(self._runtime.resource.profiles).difference(context.profiles) if context.profiles else set()
-        self._blocked_by_context = dict.fromkeys(barred, f"not in context {context.name}")
         self._update_blocked()
         if bounds := {key: request.bound(self._attributes[key]) for key, request in context.requires.items()}:
             self.adaptation.require(Requirement(name, bounds, priority=_CONTEXT_PRIORITY), now)
@@ -421,7 +351,7 @@ class Adapter(RuntimePart):
             if client != name or not bounds:
                 self.adaptation.release(client, now)
         self.adaptation.reconsider(f"context {context.name}" if context.name else "no context any more", now)
-        self._tell()
+        self._runtime.changed()
 
     def pin(self, profile: str, *, again: bool = False) -> None:
         """Choose a profile by hand; an empty name lets the loop decide. ``again``: apply it even if it runs already.
@@ -430,7 +360,7 @@ class Adapter(RuntimePart):
             ConfigError: The resource has no profile of this name.
         """
         self.adaptation.pin(profile, self._loop.time(), again=again)
-        self._tell()
+        self._runtime.changed()
 
     async def settled(self) -> None:
         """Wait until no profile is being applied, or the resource ends."""
@@ -441,7 +371,7 @@ class Adapter(RuntimePart):
         """Begin to apply a profile; the loop decides on the next one only after the outcome of this one."""
         _log.info("= %s: profile %s: %s", self._name, profile, why)
         self._deciding = {"at": time.time(), "from": self.adaptation.profile, "to": profile, "why": why}
-        self._applying = start_task(self._apply(profile), f"apply {profile}")
+        self._applying = self._work.start(self._apply(profile), f"apply {profile}")
 
     async def _apply(self, name: str) -> None:
         profile, limit, why = self._runtime.resource.profiles[name], self._settings.apply_timeout, ""
@@ -465,25 +395,20 @@ class Adapter(RuntimePart):
             _log.warning("! %s: profile %s: %s [resource-trouble]", self._name, name, why)
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
-        self.observed.clear()
+        self.clients.forget_reports()
         if why:
             self._history.append(self._deciding | {"took": self._loop.time() - began, "failed": why})
-            self.adaptation.failed(name, why, self._loop.time())
+            self.adaptation.failed(why, self._loop.time())
         else:
-            self.adaptation.applied(name, self._loop.time())
-        self._tell()
+            self.adaptation.applied(self._loop.time())
+        self._runtime.changed()
 
     def alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         """Publish an alarm, or that it is over."""
-        if cleared:
-            level, text = DiagnosticLevel.OK, f"over: {alarm}"
-        else:
-            level, text = DiagnosticLevel.WARN, str(alarm)
-            if alarm.kind is AlarmKind.NON_ADAPTABLE:
-                level = DiagnosticLevel.ERROR
-        self._log_change(text, over=cleared)
+        serious = alarm.kind is AlarmKind.NON_ADAPTABLE
         values = alarm_values(alarm, self._attributes, cleared=cleared, reaction=self.reaction)
-        self._report("alarms", level, text, values)
+        level = DiagnosticLevel.ERROR if serious else DiagnosticLevel.WARN
+        self._report_alarm(level, str(alarm), values, over=cleared)
 
     def reacted(self, profile: str, reaction: float) -> None:
         """Begin a new window, so that a profile is not judged by values measured under the previous one."""
@@ -491,8 +416,7 @@ class Adapter(RuntimePart):
         self._history.append(self._deciding | {"took": reaction})
         self.learnt.update()
         now = self._loop.time()
-        if self._measuring is not None:
-            self._measuring.restart(now)
+        self._measuring.quality.restart(now)
         if self._window_end is not None:
             self._window_end = now + self._settings.window
         _log.info("= %s: %s runs, after %.3g s", self._name, profile, reaction)
@@ -507,15 +431,14 @@ class Adapter(RuntimePart):
 
     def _handle_timer(self, now: float) -> None:
         self.adaptation.handle_timer(now)
-        self._tell()
+        self._runtime.changed()
 
-    def _tell(self) -> None:
+    def changed(self) -> None:
         """Publish what may have changed: profile, decision and responses; and move the timers."""
         if self._closed:
             return
         self._runtime.publish_text("profile", self.adaptation.profile)
         self._runtime.publish_text("decision", msgspec.json.encode(self.decision()).decode())
-        self._runtime.changed()
         refused = [name for name, client in self.clients.known.items() if client.refusal]
         statuses = [self._response(name) for name in dict.fromkeys((*self.adaptation.requirements, *refused))]
         serialized = [status.serialize() for status in statuses]
@@ -530,8 +453,7 @@ class Adapter(RuntimePart):
         client, requirement = self.clients[name], self.adaptation.requirements.get(name)
         level, message, values = DiagnosticLevel.ERROR, client.refusal, dict[str, str]()
         if requirement is not None:
-            reports = {key: self.observed.observed(name, key) for key in requirement.bounds}
-            offered = self._measured | {key: value for key, value in reports.items() if value is not None}
+            offered = {**self._measured, **client.observed}
             level, message, values = answer_to(requirement, self.adaptation, self._attributes, offered)
             if client.refusal:
                 level, message = DiagnosticLevel.ERROR, f"{client.refusal}; what was asked before stays"
@@ -559,9 +481,8 @@ class Adapter(RuntimePart):
     def health(self) -> tuple[DiagnosticLevel, str]:
         """The present level and message of the resource's ``quality`` topic."""
         missing, broken = self._runtime.problems()
-        standing = self._rules.standing.values()
-        broken += [alarm.text or f"alarm {alarm.name}: {alarm.when}" for alarm in standing]
-        level, message = health(self.adaptation, missing, broken)
+        standing = self._standing.values()
+        level, message = health(self.adaptation, missing, [*broken, *map(str, standing)])
         serious = any(alarm.error for alarm in standing) and level < DiagnosticLevel.ERROR
         return DiagnosticLevel.ERROR if serious else level, message
 
@@ -570,18 +491,21 @@ class Adapter(RuntimePart):
         level, message = self.health()
         if self._level is None or self._level[0] != level:
             self._level = level, now
-        values = self._measuring.format(self._measured) if self._measuring is not None else {}
+        values = self._measuring.quality.format(self._measured)
         values |= {"profile": self.adaptation.profile, LEVEL_FOR: f"{now - self._level[1]:.1f} s"}
         if self.reaction is not None:
             values["reaction"] = f"{self.reaction:.6g} s"
         for topic in ("quality", "diagnostics"):
             self._report(topic, level, message, values)
 
-    def _log_change(self, text: str, *, over: bool) -> None:
+    def _report_alarm(self, level: DiagnosticLevel, text: str, facts: Mapping[str, str], *, over: bool) -> None:
+        """Publish and log that an alarm is raised, or over."""
         if over:
+            level, text = DiagnosticLevel.OK, f"over: {text}"
             _log.info("= %s: %s", self._name, text)
         else:
             _log.warning("! %s: %s [resource-trouble]", self._name, text)
+        self._report("alarms", level, text, {**facts, "cleared": str(over).lower()})
 
     def _report(self, topic: str, level: DiagnosticLevel, message: str, values: Mapping[str, str]) -> None:
         name = self._runtime.resource.name

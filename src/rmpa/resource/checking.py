@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree as ET
 
 from rmpa.config.toml_file import line_of
-from rmpa.config.values import did_you_mean, suggestion
+from rmpa.config.values import Place, did_you_mean, suggestion
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.resource.declare import BindingKind
+from rmpa.resource.declare import BindingKind, ManagedNode, Parameter, ParameterValue
+from rmpa.resource.describing import DESCRIPTIONS, Knob, LiveGraph
 from rmpa.resource.expression import split_reference
-from rmpa.resource.live import DESCRIPTIONS
 from rmpa.resource.processes import command_of
 from rmpa.ros.types.descriptor import TOPIC
 from rmpa.ros.types.find import find_message_type
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
-    from rmpa.config.values import Place
-    from rmpa.resource.declare import ManagedNode, Parameter, ParameterValue, Profile
-    from rmpa.resource.live import Knob, LiveGraph
+    from rmpa.resource.decision import Profile
     from rmpa.resource.resource import Resource
 
 # A measured rate that is so much below an offer contradicts it.
@@ -191,15 +189,7 @@ class GraphCheck:
                 yield self._misfit(place, f"{value:g} is not what the node takes, {_range(knob)}")
 
     def _rules(self) -> Iterator[Misfit]:
-        resource = self.resource
-        rules: list[tuple[Place, str]] = [
-            *((("context", one.name, "when"), one.when) for one in resource.contexts.values()),
-            *((("alarm", one.name, "when"), one.when) for one in resource.alarms.values()),
-            *((("profile", one.name, "needs"), one.rule) for one in resource.profiles.values()),
-        ]
-        parsed = [(place, resource.expression(text, "rule")) for place, text in rules if text]
-        parsed += [(("attribute", n, "value"), a.value) for n, a in resource.declared_attributes.items() if a.value]
-        for place, expression in parsed:
+        for place, expression in self.resource.expressions():
             for reference in expression.references:
                 if reference.startswith("/") and (problem := self._reference(reference)):
                     yield self._misfit(place, *problem, error=False)

@@ -22,20 +22,18 @@ import time
 from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.resource.quality import EXPIRES, PRIORITY, RequirementAnswer
-from rmpa.resource.runtime import RuntimePart, topic_of
+from rmpa.resource.quality import EXPIRES, PRIORITY, QoSRequest, RequirementAnswer, Value
+from rmpa.resource.runtime import Runtime, RuntimePart, topic_of
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel
 from rmpa.ros.types.descriptor import TOPIC, Descriptor
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.tasks import end_tasks, keep_task, start_task
+from rmpa.runtime.tasks import keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
     from rmpa.resource.declare import Demand
-    from rmpa.resource.quality import QoSRequest, Value
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
     from rmpa.ros.node.node import Node
 
@@ -208,7 +206,7 @@ class Demands(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
         self._clients: dict[str, ResourceClient] = {}
         # The topics of each resource whose descriptor has been received, in this graph: by the prefix that the
         # attributes of the output have; without one by an empty text.
@@ -217,23 +215,19 @@ class Demands(RuntimePart):
 
     async def start(self) -> None:
         """Send the requests."""
-        async with contextlib.AsyncExitStack() as undo:
-            for demand in self._runtime.resource.demands.values():
-                client = await undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
-                self._clients[demand.resource] = client
-                demand.on_change = functools.partial(self._runtime.call_in_loop, self._request)
-                undo.callback(setattr, demand, "on_change", None)
-                name = f"follow {demand.resource}"
-                following = keep_task(functools.partial(self._follow, demand, client), name)
-                undo.push_async_callback(end_tasks, following)
-                if demand.requests:
-                    self._request(demand)
-                if self._runtime.resource.inputs:
-                    await self._observe(demand.resource, client)
-            self._undo = undo.pop_all()
+        for demand in self._runtime.resource.demands.values():
+            client = await self._undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
+            self._clients[demand.resource] = client
+            self._runtime.bind(demand, "on_change", self._request)
+            self._work.add(keep_task(functools.partial(self._follow, demand, client), f"follow {demand.resource}"))
+            if demand.requests:
+                self._request(demand)
+            if self._runtime.resource.inputs:
+                await self._observe(demand.resource, client)
 
     async def close(self) -> None:
         """Release all requirements."""
+        await super().close()
         await self._undo.aclose()
         self._clients.clear()
 

@@ -9,6 +9,7 @@ has been applied.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 from typing import TYPE_CHECKING, Final
@@ -16,17 +17,15 @@ from typing import TYPE_CHECKING, Final
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.adapter import HungError, call_function
 from rmpa.resource.declare import Context
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.functions import HungError, call_function
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.loop import MachineTimer
-from rmpa.runtime.tasks import OwnedTasks
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from rmpa.resource.adapter import Adapter
-    from rmpa.resource.runtime import Runtime
     from rmpa.resource.tasks import Tasks
     from rmpa.resource.values import ExpressionValues
     from rmpa.ros.node.endpoints import Received
@@ -50,30 +49,23 @@ class Contexts(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, values: ExpressionValues, tasks: Tasks, adapter: Adapter) -> None:
-        resource = runtime.resource
-        self._runtime = runtime
+        super().__init__(runtime)
         self._values = values
         self._tasks = tasks
         self._adapter = adapter
-        self._known = resource.contexts
+        self._known = runtime.resource.contexts
         # Name of the present context; empty: none.
         self.current = ""
         # Name of the context chosen by hand; empty: the rules decide. May be set before ``start``.
         self.chosen = ""
         # When the present context began, monotonic seconds.
         self._since = -math.inf
-        self._rules = {
-            name: resource.expression(context.when, f"context {name} of {resource.name}")
-            for name, context in self._known.items()
-            if context.when
-        }
-        self._references = {reference for rule in self._rules.values() for reference in rule.references}
+        self._rules = {name: one.when for name, one in self._known.items() if one.when is not None}
         self._retry = 0.0
         # Held during a switch, and from a choice to its outcome: one that fails must not undo the next.
         self._lock = asyncio.Lock()
-        self._work = OwnedTasks()
-        self._next_evaluation: float | None = None
-        self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
+        # Set when a value has changed that a rule refers to.
+        self._change = asyncio.Event()
         # True before ``start`` and after ``close``.
         self._closed = True
 
@@ -92,15 +84,19 @@ class Contexts(RuntimePart):
                 _log.warning("! %s: %s [resource-trouble]", node.name, error)
                 self.chosen = ""
         if self._rules:
-            self._values.listeners.append(self._changed)
-            self._evaluate(self._loop.time())
-            self._timer.arm()
+            self._values.on_change = self._values_changed
+            self._work.add(keep_task(self._watch, "rules of contexts"))
 
     async def close(self) -> None:
         """Stop the evaluation of rules; the present context stays."""
         self._closed = True
-        self._timer.close()
-        await self._work.close()
+        await super().close()
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles that may not run in the present context."""
+        allowed = self._known[self.current].profiles if self.current else ()
+        barred = self._runtime.resource.profiles.keys() - allowed if allowed else ()
+        return dict.fromkeys(barred, f"not in context {self.current}")
 
     async def choose(self, name: str) -> None:
         """Choose a context by hand; an empty name lets the rules decide again.
@@ -136,34 +132,35 @@ class Contexts(RuntimePart):
         values = self._values.now()
         return next((name for name, rule in self._rules.items() if rule.holds(values)), "")
 
-    def _changed(self, references: set[str]) -> None:
-        """Evaluate the rules soon if one of them refers to what has changed."""
-        if references & self._references and self._next_evaluation is not None:
-            self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
-            self._timer.arm()
+    def _values_changed(self, references: set[str]) -> None:
+        if any(not references.isdisjoint(rule.references) for rule in self._rules.values()):
+            self._change.set()
 
-    def _evaluate(self, now: float) -> None:
-        """Begin a switch if the rules select another context."""
-        self._next_evaluation = now + _INTERVAL
-        if not self._lock.locked() and now >= self._retry and self._wanted(now) != self.current:
-            self._work.start(self._follow_rules(), "switch context")
-
-    async def _follow_rules(self) -> None:
-        async with self._lock:
-            try:
-                await self._switch(self._wanted(self._loop.time()))
-            except RmpaError as error:
-                _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, error)
-                self._retry = self._loop.time() + limits.CONTEXT_RETRY
+    async def _watch(self) -> None:
+        """Switch if the rules select another context: when a value has changed, and from time to time."""
+        while True:
+            async with self._lock:
+                now = self._loop.time()
+                try:
+                    if now >= self._retry:
+                        await self._switch(self._wanted(now))
+                except RmpaError as error:
+                    _log.warning("! %s: %s [resource-trouble]", self._runtime.node.name, error)
+                    self._retry = self._loop.time() + limits.CONTEXT_RETRY
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_INTERVAL):
+                    await self._change.wait()
+                    await asyncio.sleep(_DEBOUNCE)
+            self._change.clear()
 
     def _choice_received(self, message: Received) -> None:
-        self._work.start(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
+        async def choose() -> None:
+            try:
+                await self.choose(str(message.message.data))
+            except RmpaError as error:
+                self._adapter.refuse(message.caller_id, printable(str(error)))
 
-    async def _choose_by_topic(self, name: str, client: str) -> None:
-        try:
-            await self.choose(name)
-        except RmpaError as error:
-            self._adapter.refuse(client, printable(str(error)))
+        self._work.start(choose(), "choose context")
 
     async def _switch(self, name: str) -> None:
         """Switch to a context.
@@ -182,8 +179,8 @@ class Contexts(RuntimePart):
                 limit, remedy = limits.CONTEXT_ENTER_TIMEOUT, "mend it, or leave to a task what takes longer"
                 await call_function(context.enter, "context", name, limit, remedy)
             runtime.context_outputs = context.outputs
-            self._adapter.enter_context(context)
             self.current, self._since = name, self._loop.time()
+            self._adapter.enter_context(context)
             await self._adapter.settled()
         except HungError as error:
             runtime.release(_HOLDER, drop=True)

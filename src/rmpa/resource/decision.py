@@ -15,20 +15,23 @@ tie the profile that was declared first is chosen.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from enum import Enum
+import statistics
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum, StrEnum
 from typing import TYPE_CHECKING, Final
+
+import msgspec
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
-from rmpa.resource.learnt import LearntOffer, LearntOffers
-from rmpa.resource.quality import Scale
+from rmpa.resource import limits
+from rmpa.resource.quality import Attribute, Bound, Scale, Value
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
-    from rmpa.resource.declare import Profile
-    from rmpa.resource.quality import Attribute, Bound, Value
+    from rmpa.resource.expression import Expression
 
 # What one unit of cost adds to the distance: cost decides among profiles of nearly equal shortfall.
 EPSILON: Final = 1e-3
@@ -38,6 +41,125 @@ _MISSING: Final = 1.0
 EXPECTED: Final = 1.25
 # A learnt value that differs from the declared one by more than this part of it is told in reasons.
 _NOTABLE: Final = 0.05
+
+
+class OfferSource(StrEnum):
+    """By which offers profiles are compared."""
+
+    DECLARED = "declared"
+    LEARNT = "learnt"
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One System Profile: a configuration of the resource, with the quality that it offers (paper, section 3.1).
+
+    Args:
+        name: Unique within the resource.
+        offers: The offered value of each attribute, in the attribute's unit. An attribute that only other profiles
+            offer falls short of every request.
+        cost: At least 0, in any unit that all profiles share; decides among profiles of nearly equal distance.
+        best_effort: Whether the profile runs when none meets the requirements; a resource has at most one such.
+        description: A text for people.
+        apply: The function that applies it.
+        needs: The precondition: true or ``None`` while the profile may be used, else false or the reason as a text.
+        sets: The values of parameters that it sets, by name, before ``apply``.
+        nodes: The declared nodes that must run in it, besides those that always run.
+        rule: The rule that must not be false while the profile is used; ``None``: any.
+    """
+
+    name: str
+    offers: Mapping[str, Value] = field(hash=False)
+    cost: float = 0.0
+    best_effort: bool = False
+    description: str = ""
+    apply: Callable[[], Awaitable[None] | None] = lambda: None
+    needs: Callable[[], str | bool | None] | None = None
+    sets: Mapping[str, bool | int | float | str] = field(default_factory=dict, hash=False)
+    nodes: tuple[str, ...] = ()
+    rule: Expression | None = None
+
+
+class LearntOffer(msgspec.Struct, frozen=True):
+    """What a profile has given of one attribute.
+
+    Attributes:
+        median: Of the last windows that were judged, at most ``limits.LEARNT_WINDOWS``.
+        spread: From the first to the third quartile.
+        n: The number of windows.
+    """
+
+    median: float
+    spread: float
+    n: int
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are enough windows to compare profiles by it."""
+        return self.n >= limits.LEARNT_LEAST
+
+
+class LearntOffers:
+    """The learnt offers of one resource's profiles, of the attributes that a profile declares.
+
+    Args:
+        profiles: The declared profiles.
+    """
+
+    def __init__(self, profiles: Iterable[Profile]) -> None:
+        self._windows: dict[str, dict[str, deque[float]]] = {
+            one.name: {
+                name: deque(maxlen=limits.LEARNT_WINDOWS)
+                for name, value in one.offers.items()
+                if not isinstance(value, str)
+            }
+            for one in profiles
+        }
+        # By profile and attribute; brought up to date every ``LEARNT_LEAST`` windows, so that it rarely changes.
+        self.offers: dict[str, dict[str, LearntOffer]] = {}
+        # The values to keep, by profile and attribute.
+        self.saved: dict[str, dict[str, list[float]]] = {}
+        self._since = 0
+
+    def restore(self, saved: Mapping[str, Mapping[str, list[float]]]) -> None:
+        """Take over the values that were kept before a restart; those of attributes not declared now are dropped."""
+        for profile, found in self._windows.items():
+            for name, values in found.items():
+                values.extend(saved.get(profile, {}).get(name, ()))
+        self.update()
+
+    def window(self, profile: str, measured: Mapping[str, Value]) -> None:
+        """Take the values of a window that was judged while the profile ran."""
+        for name, values in self._windows[profile].items():
+            value = measured.get(name)
+            if value is not None and not isinstance(value, str):
+                values.append(float(f"{value:.6g}"))
+        self._since += 1
+        if self._since % limits.LEARNT_LEAST == 0:
+            self._summarize()
+        if self._since % limits.LEARNT_WINDOWS == 0:
+            self.update()
+
+    def update(self) -> None:
+        """Bring all up to date: another profile runs, or the resource ends."""
+        self._summarize()
+        self.saved = {
+            profile: {name: list(values) for name, values in found.items() if values}
+            for profile, found in self._windows.items()
+            if any(found.values())
+        }
+
+    def _summarize(self) -> None:
+        self.offers = {
+            profile: {name: _summary(values) for name, values in found.items() if values}
+            for profile, found in self._windows.items()
+            if any(found.values())
+        }
+
+
+def _summary(values: deque[float]) -> LearntOffer:
+    quartiles = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else [0.0, 0.0, 0.0]
+    return LearntOffer(statistics.median(values), quartiles[2] - quartiles[0], len(values))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The parts of a declaration: parameters, topics, nodes, profiles, contexts, alarms, tasks; and their checks.
+"""The parts of a declaration: parameters, topics, nodes, contexts, alarms, tasks; and their checks.
 
 While the resource runs, ``rmpa.resource.runtime`` binds these to a node: it sets their fields ``on_…``.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import shlex
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -16,6 +17,7 @@ from rmpa.config.rules import CONTRACT_RULES, TERMS
 from rmpa.config.values import BadValue, suggestion
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
+from rmpa.core.identity import is_legal_name
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type
@@ -32,11 +34,12 @@ ParameterValue = bool | int | float | str
 _ROS_TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
 
 
-class OfferSource(StrEnum):
-    """By which offers profiles are compared."""
+class Role(StrEnum):
+    """The function of a module in the robot (paper, section 3)."""
 
-    DECLARED = "declared"
-    LEARNT = "learnt"
+    SENSING = "sensing"
+    ACTING = "acting"
+    CONTROLLING = "controlling"
 
 
 class Measure(StrEnum):
@@ -48,36 +51,6 @@ class Measure(StrEnum):
     SUBSCRIBE = "subscribe"
     # By the node's own counters of its connections (getBusStats): rate and bandwidth, without another subscriber.
     COUNTERS = "counters"
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptationSettings:
-    """Parameters of a resource's control loop (``rmpa.resource.adaptation``).
-
-    Args:
-        violations: ``k``: the number of violated windows among the last ``windows`` that is a disturbance.
-        windows: ``n``: the number of last windows that are considered.
-        improvement: ``h``: hysteresis; a change without a disturbance must reduce the distance by more than this.
-        window: Length of a quality window, in seconds.
-        dwell: Least number of seconds that a profile runs before a change without a disturbance.
-        settle: Settling time: windows that begin within so many seconds of a change are not judged, because messages
-            that were queued under the previous profile still arrive.
-        cool_down: Seconds for which a profile is excluded after it failed or was violated.
-        cool_down_max: The longest cool-down; it doubles with each further failure.
-        apply_timeout: Seconds after which a profile that is being applied counts as hung.
-        offers: Whether profiles are compared by what their author declared, or by what they have given (``learnt``).
-    """
-
-    violations: int = 2
-    windows: int = 3
-    improvement: float = 0.05
-    window: float = 1.0
-    dwell: float = 2.0
-    settle: float = 1.0
-    cool_down: float = 10.0
-    cool_down_max: float = 160.0
-    apply_timeout: float = 5.0
-    offers: OfferSource = OfferSource.DECLARED
 
 
 class BindingKind(StrEnum):
@@ -187,6 +160,17 @@ class Parameter:
         for value in (*self.choices, self.default):
             self.check(value)
 
+    def check_rate(self, most: float, where: str) -> None:
+        """Check that each of its values can be the rate of a task, at most ``most`` Hz.
+
+        Raises:
+            ConfigError: It is no number, or has other bounds.
+        """
+        low, high = self.bounds
+        if self.type not in ("int", "double") or not low > 0 or not high <= most:
+            remedy = f"declare it with low above 0 and high at most {most:g}"
+            raise ConfigError(where, f"{self.name} may be what no rate can be", remedy)
+
     def check(self, value: ParameterValue) -> ParameterValue:
         """Return the value, converted to ``float`` where that is the parameter's type.
 
@@ -224,6 +208,9 @@ class DeclaredTopic:
         DefinitionError: The type's name is malformed, or rmpa comes with its package, which has no such type.
     """
 
+    # Whether another node publishes or receives it, so that the resource only measures it or looks for a publisher.
+    observed = False
+
     def __init__(self, name: str, type_name: str, contract: Contract, label: str = "") -> None:
         self.name = name
         self.label = label
@@ -258,8 +245,6 @@ class Output(DeclaredTopic):
 
     # Whether a late subscriber gets the last message.
     latch = False
-    # Whether another node publishes it, so that the resource only measures it.
-    observed = False
     # How an observed one is measured.
     measure = Measure.AUTO
     # Called in any thread with ``(message fields, whole message)``; ``None`` while the resource does not run.
@@ -285,8 +270,6 @@ class Input(DeclaredTopic):
 
     # Whether the resource is stale while the topic has no publisher.
     required = True
-    # Whether another node receives it, so that the resource only looks whether it is published.
-    observed = False
 
 
 @dataclass(eq=False)
@@ -341,50 +324,24 @@ class Demand:
 
 
 @dataclass(frozen=True, slots=True)
-class Profile:
-    """One System Profile: a configuration of the resource, with the quality that it offers (paper, section 3.1).
-
-    Args:
-        name: Unique within the resource.
-        offers: The offered value of each attribute, in the attribute's unit. An attribute that only other profiles
-            offer falls short of every request.
-        cost: At least 0, in any unit that all profiles share; decides among profiles of nearly equal distance.
-        best_effort: Whether the profile runs when none meets the requirements; a resource has at most one such.
-        description: A text for people.
-        apply: The function that applies it.
-        needs: The precondition: true or ``None`` while the profile may be used, else false or the reason as a text.
-        sets: The values of parameters that it sets, by name, before ``apply``.
-        nodes: The declared nodes that must run in it, besides those that always run.
-        rule: A rule that must not be false while the profile is used; empty: none.
-    """
-
-    name: str
-    offers: Mapping[str, Value] = field(hash=False)
-    cost: float = 0.0
-    best_effort: bool = False
-    description: str = ""
-    apply: Hook = lambda: None
-    needs: Callable[[], str | bool | None] | None = None
-    sets: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
-    nodes: tuple[str, ...] = ()
-    rule: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class AlarmRule:
     """An alarm that a rule raises, beside those of the control loop.
 
     Args:
         name: Unique within the resource.
-        when: The rule over topics, parameters and attributes; the alarm stands while it is true.
+        when: The rule; the alarm stands while it is true.
         error: Whether it is an ERROR; else a WARN.
         text: What people read; empty: the rule.
     """
 
     name: str
-    when: str
+    when: Expression
     error: bool = False
     text: str = ""
+
+    def __str__(self) -> str:
+        """What people read."""
+        return self.text or f"alarm {self.name}: {self.when}"
 
 
 class RestartPolicy(StrEnum):
@@ -428,6 +385,28 @@ class ManagedNode:
     stop_after: float = 10.0
     server: str = ""
 
+    def check(self, where: str) -> None:
+        """Check the names in it, and how it is started.
+
+        Raises:
+            ConfigError: A name is illegal, or there are several ways to start it; ``where`` begins the error's text.
+        """
+        if not self.key or not is_legal_name(self.key) or "/" in self.key or self.key.startswith("~"):
+            raise ConfigError(where, f"{self.key!r} is not a base name", "letters, digits and _, a letter first")
+        if not self.name.startswith("/") or not is_legal_name(self.name) or self.name == "/":
+            raise ConfigError(where, f"{self.name!r} is not a global name of a node", f"for example /{self.key}")
+        if sum(map(bool, (self.run, self.launch, self.command))) > 1:
+            raise ConfigError(where, "run, launch and command are three ways to start it", "keep one of them")
+        if self.server and (not self.server.startswith("/") or not is_legal_name(self.server)):
+            raise ConfigError(where, f"{self.server!r} is not a global name", f"for example {self.name}/debayer")
+        for text, least in ((self.run, 2), (self.launch, 1)):
+            try:
+                enough = not text or len(shlex.split(text)) >= least
+            except ValueError:  # a quote is not closed
+                enough = False
+            if not enough:
+                raise ConfigError(where, f"{text!r} does not name a program", "write PACKAGE NAME, as for rosrun")
+
     @property
     def started(self) -> bool:
         """Whether the declaration says how it is started."""
@@ -447,7 +426,7 @@ class Context:
 
     Args:
         name: Unique within the resource.
-        when: A rule (``resource.expression``) that selects the context; empty: it is chosen by hand only.
+        when: The rule that selects the context; ``None``: it is chosen by hand only.
         requires: QoS requests on the resource itself, by attribute.
         profiles: The only profiles that may run in the context; empty: any.
         outputs: The only outputs that are published in the context, by name; ``None``: all.
@@ -455,7 +434,7 @@ class Context:
     """
 
     name: str
-    when: str = ""
+    when: Expression | None = None
     requires: Mapping[str, QoSRequest] = field(default_factory=dict, hash=False)
     profiles: tuple[str, ...] = ()
     outputs: tuple[str, ...] | None = None
@@ -543,6 +522,18 @@ def read_enum(kind: type[Any], text: str, where: str) -> Any:
     if text not in known:
         _refuse_unknown(where, f"{text!r} is not known here", text, known)
     return kind(text)
+
+
+def check_known(kind: str, names: Iterable[str], known: Mapping[str, object], where: str, remedy: str = "") -> None:
+    """Check that names are declared; ``where`` begins the error's text, and ``remedy`` is for one like no other.
+
+    Raises:
+        ConfigError: One is not.
+    """
+    for name in names:
+        if name not in known:
+            otherwise = remedy or f"declared are {', '.join(known) or 'none'}"
+            raise ConfigError(where, f"there is no {kind} {name}", suggestion(name, known, otherwise))
 
 
 def _refuse_unknown(where: str, problem: str, text: str, known: Iterable[str], listed: str = "it is one of ") -> None:

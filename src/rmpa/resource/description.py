@@ -33,13 +33,13 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.rules import CONTRACT_RULES, TERMS
 from rmpa.config.schema import NEEDED, Setting
 from rmpa.config.toml_file import dotted, line_of, read_toml
-from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, ValueType, list_of, member_of, text_type
+from rmpa.config.values import BOOL, TEXT, BadValue, JsonSchema, Place, ValueType, list_of, member_of, text_type
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.identity import is_legal_name
 from rmpa.resource import limits
-from rmpa.resource.declaration import Role
-from rmpa.resource.declare import Binding, BindingKind, Measure, OfferSource, RestartPolicy
-from rmpa.resource.quality import Category, Direction, Scale, parse_request, quantity
+from rmpa.resource.decision import OfferSource
+from rmpa.resource.declare import Binding, BindingKind, Measure, RestartPolicy, Role
+from rmpa.resource.quality import Category, Direction, QoSRequest, Scale, parse_request, quantity
 from rmpa.resource.resource import Resource
 from rmpa.runtime.programs import StartRule
 
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
-    from rmpa.config.values import Place
-    from rmpa.resource.quality import QoSRequest
 
 # The end of the name of a file that describes a resource.
 SUFFIX: Final = ".resource.toml"
@@ -316,15 +314,14 @@ class _Reader:
         table: Any = self._table
         for part in place:
             table = table[part]
-        for name, key in keys.items():
-            if key.default is NEEDED and name not in table:
-                raise BadValue(f"it has no {name}", key.help)
         found = {}
         for name, key in keys.items():
             if name in table:
                 self._place = (*place, name)
                 found[name] = key.type.read(table[name])
-        self._place = place
+                self._place = place
+            elif key.default is NEEDED:
+                raise BadValue(f"it has no {name}", key.help)
         return found
 
     def _named(self, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -57,6 +57,19 @@ _COMPARISONS: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
 _SUMS: Final[Mapping[str, Callable[[Any, Any], float]]] = {"+": operator.add, "-": operator.sub}
 _PRODUCTS: Final[Mapping[str, Callable[[Any, Any], float]]] = {"*": operator.mul, "/": operator.truediv}
 _CALCULATIONS: Final[Mapping[str, Callable[..., float]]] = {"min": min, "max": max, "abs": abs}
+# Functions that the running resource answers, with the numbers of their arguments.
+SOURCES: Final[Mapping[str, tuple[int, ...]]] = {
+    # Processor time of a node's process as a share of one core; memory that it holds, bytes. Without a name: of the
+    # resource's only node.
+    "cpu": (0, 1),
+    "memory": (0, 1),
+    # Of the machine: the hottest thermal zone, or the zone of this type, in °C.
+    "temperature": (0, 1),
+    # The number in a value of /diagnostics: name of the status, key; or the level of the status, 0 to 3.
+    "diagnostics": (1, 2),
+    # Whether a node is registered at the core and answers.
+    "running": (1,),
+}
 _KEYWORDS: Final = ("and", "or", "not", "true", "false")
 _EXAMPLE: Final = "for example /battery/charging == true and ~gain > 3"
 
@@ -79,15 +92,21 @@ class Expression:
     """A parsed expression.
 
     Args:
+        text: As it was written.
         value: The value by the known values, which are by reference; ``None``: it depends on unknown values.
         references: Each variable once, as written: ``/topic.field``, ``~parameter``, an attribute's name, or the text
             of a source.
         sources: The functions among the references, by their text.
     """
 
+    text: str
     value: _Value
     references: tuple[str, ...]
     sources: Mapping[str, SourceCall]
+
+    def __str__(self) -> str:
+        """The text."""
+        return self.text
 
     def holds(self, values: Mapping[str, Scalar]) -> bool | None:
         """Whether the expression, as a rule, is true; ``None``: that depends on unknown values."""
@@ -95,12 +114,7 @@ class Expression:
 
 
 def parse_expression(
-    text: str,
-    parameters: Collection[str],
-    where: str = "rule",
-    *,
-    attributes: Collection[str] = (),
-    sources: Mapping[str, tuple[int, ...]] | None = None,
+    text: str, parameters: Collection[str], where: str = "rule", *, attributes: Collection[str] = ()
 ) -> Expression:
     """Parse an expression.
 
@@ -109,21 +123,20 @@ def parse_expression(
         parameters: Names of the resource's parameters.
         where: Description of the expression, for errors.
         attributes: Names of the attributes that it may use.
-        sources: The functions that the running resource answers, each with the numbers of arguments that it takes.
 
     Raises:
         ConfigError: It has a syntax error or an unknown name, or is too long or nested too deeply.
     """
     if len(text) > limits.CONTEXT_RULE_MAX:
         raise ConfigError(where, f"{len(text)} characters", f"at most {limits.CONTEXT_RULE_MAX}")
-    parser = _Parser(text, where, attributes, sources or {})
+    parser = _Parser(text, where, attributes)
     value = parser.parse()
     for name in (reference[1:] for reference in parser.references if reference.startswith("~")):
         if name not in parameters:
             near = did_you_mean(name, parameters)
             remedy = f"did you mean ~{near}?" if near else "declare it before the context"
             raise ConfigError(where, f"there is no parameter {name}", remedy)
-    return Expression(value, tuple(parser.references), parser.found)
+    return Expression(text, value, tuple(parser.references), parser.found)
 
 
 def split_reference(text: str) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -140,13 +153,10 @@ def split_reference(text: str) -> Iterator[tuple[str, tuple[str, ...]]]:
 class _Parser:
     """A recursive-descent parser of one expression."""
 
-    def __init__(
-        self, text: str, where: str, attributes: Collection[str], sources: Mapping[str, tuple[int, ...]]
-    ) -> None:
+    def __init__(self, text: str, where: str, attributes: Collection[str]) -> None:
         self._text = text
         self._where = where
         self._attributes = attributes
-        self._sources = sources
         self.references: dict[str, None] = {}
         self.found: dict[str, SourceCall] = {}
         self._tokens: deque[tuple[str, str]] = deque()
@@ -168,6 +178,10 @@ class _Parser:
     def _take(self, *lexemes: str) -> str:
         """Remove the next token and return it if it is one of these; else nothing."""
         return self._tokens.popleft()[1] if self._tokens[0][1] in lexemes else ""
+
+    def _close(self) -> None:
+        if not self._take(")"):
+            raise self._error("a bracket is not closed")
 
     def _rule(self, depth: int) -> _Value:
         return self._chain("or", lambda: self._chain("and", lambda: self._negation(depth)))
@@ -216,8 +230,7 @@ class _Parser:
             return _calculated(operator.neg, self._value(depth + 1))
         if self._take("("):
             inner = self._rule(depth + 1)
-            if not self._take(")"):
-                raise self._error("a bracket is not closed")
+            self._close()
             return inner
         kind, piece = self._tokens[0]
         if not kind or kind == "sign":
@@ -245,8 +258,8 @@ class _Parser:
         self._tokens.popleft()
         if word in _CALCULATIONS:
             return self._calculate(word, depth)
-        if (counts := self._sources.get(word)) is None:
-            known = [*_CALCULATIONS, *self._sources]
+        if (counts := SOURCES.get(word)) is None:
+            known = [*_CALCULATIONS, *SOURCES]
             remedy = suggestion(word, known, f"there are {', '.join(known)}")
             raise self._error(f"there is no function {word}", remedy)
         arguments = []
@@ -268,8 +281,7 @@ class _Parser:
         parts = [self._rule(depth + 1)]
         while self._take(","):
             parts.append(self._rule(depth + 1))
-        if not self._take(")"):
-            raise self._error("a bracket is not closed")
+        self._close()
         if (len(parts) == 1) != (word == "abs"):
             raise self._error(f"{word} takes {'one value' if word == 'abs' else 'two values or more'}", "")
         return _calculated(_CALCULATIONS[word], *parts)

@@ -2,29 +2,43 @@
 
 Only sums are kept, so each message costs the same. Values that a window cannot determine (the standard deviation of a
 single period, a latency without a stamp) are left out and not judged.
+
+What other nodes publish is measured by subscribing to it, as any node does; nothing of it is passed on. A second
+subscriber of much data costs the publisher, so such a topic is measured by what its publishers count themselves
+(``getBusStats``): rate and bandwidth to their other subscribers. Whether a topic has a publisher at all is asked of
+the master where there is no subscription.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 import math
 import struct
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.errors import ConfigError
+from rmpa.core.errors import RmpaError
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK
 from rmpa.resource import limits
-from rmpa.resource.quality import Direction, find_attribute
-from rmpa.ros.wire.slave_api import sent_between
+from rmpa.resource.declare import DeclaredTopic, Measure, Output
+from rmpa.resource.runtime import Runtime, RuntimePart, topic_of
+from rmpa.ros.http.rpc import call, call_api, exchange, read_response
+from rmpa.ros.wire.slave_api import Sent, read_bus_stats, sent_between
+from rmpa.ros.wire.tcpros import printable
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, call_pieces
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.resource.declare import DeclaredTopic
-    from rmpa.resource.quality import Attribute, Value
+    from rmpa.resource.quality import Value
     from rmpa.resource.resource import Resource
-    from rmpa.ros.wire.slave_api import Sent
+    from rmpa.resource.values import ExpressionValues
+    from rmpa.ros.node.endpoints import Received
 
+_log = logging.getLogger(__name__)
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 # Number of publishers of one topic whose sequence numbers are tracked; one more, and the tracking starts afresh.
@@ -33,6 +47,15 @@ _SOURCES: Final = 64
 # window.
 _COUNTED: Final = 10
 _COUNTED_SPAN: Final = 5.0
+# Consecutive windows for which something must be missing before it is reported, since connecting takes a while.
+MISSING_WINDOWS: Final = 2
+# The data of so many seconds decide whether a topic carries much; a latched message that comes once does not count.
+_SPAN: Final = 5.0
+# Seconds between two questions to nodes and master: at least, and where windows are longer.
+_LEAST: Final = 0.2
+_MOST: Final = 1.0
+# Seconds for a node's answer.
+_ANSWER: Final = 1.0
 
 
 class TopicQuality:
@@ -178,13 +201,12 @@ class QualityMeasurement:
     def __init__(self, resource: Resource, now: float) -> None:
         self._attributes = resource.attributes
         self._labels = resource.labels
-        self._declared = resource.declared_attributes
         self._topics: dict[str, TopicQuality | TopicCounters] = {}
         # Inputs whose type is not known yet, by name; it is learnt from their first publisher.
         self._unknown: dict[str, DeclaredTopic] = {}
         for name, topic in (resource.outputs | resource.inputs).items():
             # The resource numbers its own messages without a gap.
-            self._add(topic, now, numbered=name in resource.inputs or getattr(topic, "observed", False))
+            self._add(topic, now, numbered=name in resource.inputs or topic.observed)
             if topic.known is None:
                 self._unknown[name] = topic
         # The first output; its attributes are also available without the output's label.
@@ -198,7 +220,7 @@ class QualityMeasurement:
         self._observed: dict[str, Value] = {}
 
     def message(self, topic: str, raw: bytes, now: float, now_ns: int, caller: str = "") -> None:
-        """Measure a message that an output has sent or an input has received.
+        """Measure a message that was sent or received.
 
         Args:
             topic: Declared name of the output or input.
@@ -227,9 +249,7 @@ class QualityMeasurement:
         )
 
     def observe(self, attribute: str, value: Value) -> None:
-        """Record a valid value that the user's code has observed of a declared attribute; others are ignored."""
-        if attribute not in self._declared:
-            return
+        """Record a valid value that the user's code has observed of a declared attribute."""
         if isinstance(value, str):
             self._observed[attribute] = value
         else:
@@ -267,77 +287,6 @@ class QualityMeasurement:
         return shown | {f"{self._labels[name]}.measured": "by its node's counters" for name in counted}
 
 
-# Quality as observed by clients, and things that a resource lacks; both are judged once in each window.
-#
-# A resource measures the messages that it sends. Fewer may arrive in another module, where only the client can
-# measure the loss.
-
-
-# Consecutive windows for which something must be missing before it is reported, since connecting takes a while.
-MISSING_WINDOWS: Final = 2
-_WORSE: Final = {Direction.MAX: -1, Direction.MIN: 1}
-
-
-class ObservedQualities:
-    """The last report of each client.
-
-    Args:
-        attributes: The resource's attributes, by name.
-        resource: Name of the resource, for errors.
-        lifespan: Seconds for which a report counts.
-    """
-
-    def __init__(self, attributes: Mapping[str, Attribute], resource: str, lifespan: float) -> None:
-        self._attributes = attributes
-        self._resource = resource
-        self._lifespan = lifespan
-        self._reports: dict[str, tuple[float, dict[str, Value]]] = {}
-
-    def report(self, client: str, values: Iterable[tuple[str, str]], now: float) -> None:
-        """Take a client's report of attributes and values as texts, in place of its previous report.
-
-        Raises:
-            ConfigError: An attribute is unknown or a value is invalid; the whole report is dropped.
-        """
-        found: dict[str, Value] = {}
-        for number, (name, text) in enumerate(values):
-            where = f"observation of {name}"
-            if number >= limits.REQUIREMENT_BOUNDS_MAX:
-                raise ConfigError(where, f"more than {limits.REQUIREMENT_BOUNDS_MAX} attributes")
-            found[name] = find_attribute(self._attributes, name, self._resource).parse(text, where)
-        self._reports[client] = (now, found)
-
-    def observed(self, client: str, name: str) -> Value | None:
-        """The value of an attribute in a client's last report; ``None``: it has none."""
-        _, found = self._reports.get(client, (0.0, {}))
-        return found.get(name)
-
-    def worst(self, measured: Mapping[str, Value], clients: Collection[str], now: float) -> dict[str, Value]:
-        """For each attribute the worst of the measured and the reported values.
-
-        Args:
-            measured: The resource's own measurements, by attribute.
-            clients: The clients that have a requirement; reports of others do not count.
-            now: Monotonic seconds.
-
-        Returns:
-            Values by attribute. Where no direction is better, a reported value replaces the measured one.
-        """
-        self._reports = {client: r for client, r in self._reports.items() if now - r[0] <= self._lifespan}
-        worst = dict(measured)
-        for client, (_, found) in self._reports.items():
-            for name, value in found.items() if client in clients else ():
-                attribute, known = self._attributes[name], worst.get(name)
-                sign = _WORSE.get(attribute.direction)
-                if known is None or not sign or sign * (attribute.position(value) - attribute.position(known)) > 0:
-                    worst[name] = value
-        return worst
-
-    def clear(self) -> None:
-        """Drop all reports, because they describe the previous profile."""
-        self._reports.clear()
-
-
 def count_missing(windows: dict[str, int], missing: Iterable[str]) -> list[tuple[str, bool]]:
     """Count what a resource lacks, so that short absences are not reported.
 
@@ -356,3 +305,158 @@ def count_missing(windows: dict[str, int], missing: Iterable[str]) -> list[tuple
         if windows[text] == MISSING_WINDOWS:
             changes.append((text, True))
     return changes
+
+
+class Measuring(RuntimePart):
+    """Measures one resource, and looks at the nodes that others start for it; starts before the adapter.
+
+    Args:
+        runtime: The runtime of the resource.
+        values: A topic that an expression names stays subscribed to.
+    """
+
+    def __init__(self, runtime: Runtime, values: ExpressionValues) -> None:
+        super().__init__(runtime)
+        self._values = values
+        self.quality = QualityMeasurement(runtime.resource, 0.0)
+        resource, node = runtime.resource, runtime.node.name
+        # Observed outputs, and those of them that are counted, by global name.
+        self._outputs = {topic_of(one.name, node): one for one in resource.outputs.values() if one.observed}
+        self._counted: dict[str, Output] = {
+            topic: one for topic, one in self._outputs.items() if one.measure is Measure.COUNTERS
+        }
+        # Outputs without which a profile does, for it offers no messages of them.
+        none = {key for one in resource.profiles.values() for key, value in one.offers.items() if value == 0}
+        labels, first = resource.labels, next(iter(resource.outputs), "")
+        self._optional = {
+            name for name in resource.outputs if f"{labels[name]}.rate" in none or (name == first and "rate" in none)
+        }
+        # Required inputs that other nodes receive, by global name.
+        self._inputs = {
+            topic_of(one.name, node): one.name for one in resource.inputs.values() if one.observed and one.required
+        }
+        # By output that may yet be counted: when the first of the messages that decide has come, and the bytes of the
+        # later ones.
+        self._carried = {one.name: (-_SPAN, 0) for one in self._outputs.values() if one.measure is Measure.AUTO}
+        # What the master said last; empty: it has not been asked. In it: the publishers of each topic, and all nodes.
+        self._said = b""
+        self._publishers: Mapping[str, Sequence[str]] = {}
+        self._present: set[str] = set()
+        self._uris: dict[str, str] = {}
+
+    async def start(self) -> None:
+        """Begin to measure: by subscribing, or by asking for counters."""
+        self._loop = asyncio.get_running_loop()
+        self.quality.restart(self._loop.time())
+        self._runtime.listeners.append(self._heard)
+        for declared in self._runtime.resource.declared_attributes.values():
+            self._runtime.bind(declared, "on_observation", self.quality.observe)
+        for output in self._outputs.values():
+            if output.measure is not Measure.COUNTERS:
+                await self._runtime.receive(output)
+        if self._outputs or self._inputs or self._runtime.resource.nodes:
+            with contextlib.suppress(RmpaError):
+                await self._look()
+            self._work.add(keep_task(self._watch, f"observe for {self._runtime.resource.name}"))
+
+    def _heard(self, topic: DeclaredTopic, raw: bytes, stamp_ns: int, message: Received | None) -> None:
+        now = self._loop.time()
+        self.quality.message(topic.name, raw, now, stamp_ns, message.caller_id if message is not None else "")
+        if topic.name in self._carried:
+            self._weigh(topic.name, len(raw), now)
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Topics that no node publishes, and publishers of another type."""
+        absent, named = self._absent()
+        missing, broken = [f"node {name} does not run" for key, name in absent.items() if key not in named], []
+        for topic, output in self._outputs.items():
+            subscriber = self._runtime.subscribers.get(output.name)
+            if subscriber is None and (not self._said or self._publishers.get(topic)):
+                continue
+            if (subscriber is None or not subscriber.publishers) and output.name not in self._optional:
+                missing.append(f"no node publishes {output.name}")
+                refusals = [*subscriber.refusals.values()][-1:] if subscriber is not None else []
+                broken += [f"{output.name}: {printable(text)}" for text in refusals]
+        if self._said:
+            missing += [
+                f"no node publishes {name}" for topic, name in self._inputs.items() if not self._publishers.get(topic)
+            ]
+        return missing, broken
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run, with the reason: a node does not run that nothing here starts."""
+        absent, named = self._absent()
+        return {
+            one.name: f"node {name} does not run"
+            for one in self._runtime.resource.profiles.values()
+            for key, name in absent.items()
+            if key not in named or key in one.nodes
+        }
+
+    def _absent(self) -> tuple[dict[str, str], set[str]]:
+        """The nodes that nothing here starts and that do not run, by their keys, and those that profiles name."""
+        resource = self._runtime.resource
+        others = {one.key: one.name for one in resource.nodes.values() if not one.started and self._said}
+        named = {key for one in resource.profiles.values() for key in one.nodes}
+        return {key: name for key, name in others.items() if name not in self._present}, named
+
+    def _weigh(self, name: str, size: int, now: float) -> None:
+        """Change to counters if an output carries much."""
+        began, carried = self._carried[name]
+        carried = carried + size if now - began < _SPAN else 0
+        self._carried[name] = (began if carried else now), carried
+        much = carried > limits.MEASURED_BYTES * max(1.0, now - began)
+        if not much or self._values.uses(name) or name not in self._runtime.subscribers:
+            return
+        del self._carried[name]
+        self._counted[topic_of(name, self._runtime.node.name)] = self._runtime.resource.outputs[name]
+        self.quality.counted(name, {}, now)
+        self._work.start(self._runtime.subscribers.pop(name).close(), f"measure {name} by counters")
+        text = f"more than {limits.MEASURED_BYTES // 1024} KiB a second; it is measured by its node's own counters"
+        _log.info("= %s: %s carries %s: rate and bandwidth only", self._runtime.node.name, name, text)
+
+    async def _watch(self) -> None:
+        period = min(max(self._runtime.resource.settings.window, _LEAST), _MOST)
+        while True:
+            try:
+                if self._counted or self._inputs or self._runtime.resource.nodes:
+                    await self._look()
+                    await self._count()
+            except (RmpaError, RosFault) as error:
+                _log.debug("! %s: %s", self._runtime.node.name, error)
+            await asyncio.sleep(period)
+
+    async def _look(self) -> None:
+        """Ask the master which nodes publish what; the same answer as before is not read again."""
+        node = self._runtime.node
+        question = b"".join(call_pieces("getSystemState", [node.name]))
+        said = await exchange(node.master_uri, "getSystemState", question, timeout=_ANSWER * 5)
+        if said == self._said:
+            return
+        match RosReply.of(await read_response(said)).value:
+            case [[*published], [*subscribed], [*served]]:
+                known = {str(topic): list(map(str, names)) for topic, names in published}  # type: ignore[misc, arg-type]
+                mine = self._outputs.keys() | self._inputs.keys()
+                self._publishers = {topic: [n for n in known.get(topic, ()) if n != node.name] for topic in mine}
+                self._present = {str(name) for _, names in (*published, *subscribed, *served) for name in names}  # type: ignore[misc, union-attr]
+                self._said, self._uris = said, {}
+
+    async def _count(self) -> None:
+        """Ask the publishers of counted topics for their counters."""
+        nodes = [*dict.fromkeys(name for topic in self._counted for name in self._publishers.get(topic, ()))]
+        answers = dict(zip(nodes, await asyncio.gather(*map(self._ask, nodes)), strict=True))
+        for topic, output in self._counted.items():
+            names = self._publishers.get(topic, ())
+            sent = {name: found.get(topic, {}) for name in names if (found := answers.get(name)) is not None}
+            self.quality.counted(output.name, sent, self._loop.time())
+
+    async def _ask(self, node: str) -> dict[str, Sent] | None:
+        """What a node has sent, by topic; ``None`` if it does not answer."""
+        own = self._runtime.node
+        try:
+            if node not in self._uris:
+                self._uris[node] = str((await call_api(own.master_uri, "lookupNode", own.name, node)).value)
+            return read_bus_stats(await call(self._uris[node], "getBusStats", own.name, timeout=_ANSWER))
+        except (RmpaError, RosFault) as error:
+            _log.debug("! %s: counters of %s: %s", own.name, node, error)
+            return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 from typing import TYPE_CHECKING, Final
 
@@ -11,20 +10,19 @@ from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaE
 from rmpa.resource.actuation import Actuation
 from rmpa.resource.adapter import Adapter
 from rmpa.resource.client import Demands
-from rmpa.resource.configuration import Reconfigure
 from rmpa.resource.contexts import Contexts
-from rmpa.resource.observing import Observing
+from rmpa.resource.functions import call_hook
+from rmpa.resource.measuring import Measuring
 from rmpa.resource.processes import Processes
+from rmpa.resource.reconfigure import Reconfigure
 from rmpa.resource.runtime import LifecycleState, Runtime
 from rmpa.resource.saved import Persistence, SavedCoolDown, SavedState
-from rmpa.resource.sources import Sources
 from rmpa.resource.tasks import Tasks
 from rmpa.resource.values import ExpressionValues
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.node.node import Node
 from rmpa.ros.wire.tcpros import printable
-from rmpa.runtime.accept import in_thread
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
 
     from rmpa.resource.declare import Output
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import RuntimePart
 
 _log = logging.getLogger(__name__)
 
@@ -76,24 +73,21 @@ class ResourceNode:
         self.runtime.close_outputs()
         self.processes = Processes(self.runtime, state.parent if state is not None else None)
         self.tasks = Tasks(self.runtime, self._deactivate_soon)
-        self.values = ExpressionValues(self.runtime, resource.expressions())
+        self.values = ExpressionValues(self.runtime, self.processes)
         self.actuation = Actuation(self.runtime, self.processes)
+        measuring = Measuring(self.runtime, self.values)
         stop = stop if stop is not None else asyncio.Event()
-        observing = Observing(self.runtime, self.values)
-        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, observing, stop)
-        self.adapter.processes = self.processes
+        self.adapter = Adapter(self.runtime, self.values, self.tasks, self.actuation, measuring, stop)
         self.processes.on_change = self.adapter.node_changed
         self.contexts = Contexts(self.runtime, self.values, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.actuation, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
-        # In the order of their start.
-        self.parts: list[RuntimePart] = [
+        self.runtime.parts = [
             self.processes,
             self.values,
-            Sources(self.runtime, self.values, self.processes),
             self.tasks,
             self.actuation,
-            observing,
+            measuring,
             self.adapter,
             self.contexts,
             self.configuration,
@@ -102,7 +96,7 @@ class ResourceNode:
         self._persistence: Persistence | None = None
         if state is not None:
             self._persistence = Persistence(self.runtime, self._state, state)
-            self.parts.append(self._persistence)
+            self.runtime.parts.append(self._persistence)
         # The profile that ran last; empty: none yet.
         self._last = ""
         # The transition whose callback runs; empty: none.
@@ -150,19 +144,8 @@ class ResourceNode:
         """
         await self._refuse_duplicate()
         await self.learn()
-        if self._persistence is not None:
-            saved = self.adapter.saved = await self._persistence.restore()
-            self.adapter.preset, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
-            self.actuation.by_hand |= saved.by_hand
-        given = {name: self.resource.parameters[name] for name in self.resource.bound}
-        self.actuation.by_hand |= {name: one.value for name, one in given.items() if one.given}
-        try:
-            # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
-            await self.runtime.start(self.parts, self.configuration.load, self._configure)
-        except BaseException:
-            if self._persistence is not None:
-                await self._persistence.close()
-            raise
+        # Parameters are loaded before ``configure``, which opens the device before a profile sets it.
+        await self.runtime.start(self._restore, self.configuration.load, self._configure)
         try:
             await self.adapter.settled()  # the function of the first profile ends before ``activate``
             if self.adapter.hung is not None:
@@ -171,6 +154,12 @@ class ResourceNode:
         except RmpaError:
             await self.close()
             raise
+
+    async def _restore(self) -> None:
+        if self._persistence is not None:
+            saved = self.adapter.saved = await self._persistence.restore()
+            self.adapter.adaptation.pinned, self.contexts.chosen, self._last = saved.chosen, saved.context, saved.last
+            self.actuation.by_hand = saved.by_hand | self.actuation.by_hand
 
     async def activate(self) -> None:
         """Activate an inactive resource: open the outputs, call its callback, then start the tasks.
@@ -242,14 +231,9 @@ class ResourceNode:
         elif transition == "activate":
             runtime.open_outputs()
         why = ""
-        hook = self.resource.hooks.get(transition)
         try:
-            if inspect.iscoroutinefunction(hook):
-                await hook()
-            elif hook is not None:
-                outcome = await in_thread(hook, transition)
-                if outcome is not None:
-                    await outcome
+            if (hook := self.resource.hooks.get(transition)) is not None:
+                await call_hook(hook, transition)
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             why = f"{type(error).__name__}: {error}"
             _log.warning("! %s: %s: %s [resource-trouble]", runtime.node.name, transition, why)

@@ -18,39 +18,27 @@ import time
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.timers import Backoff
 from rmpa.resource import limits
-from rmpa.resource.declare import RestartPolicy
-from rmpa.resource.runtime import LifecycleState, RuntimePart
+from rmpa.resource.declare import ManagedNode, RestartPolicy
+from rmpa.resource.runtime import LifecycleState, Runtime, RuntimePart
 from rmpa.ros.environment import host_of, is_loopback
 from rmpa.ros.executables import find_executable, find_program
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.programs import (
-    LOGS,
-    RUNS,
-    NodeRun,
-    ProgramMark,
-    ResourceRun,
-    end_program,
-    ended,
-    figures,
-    how_ended,
-    read_log,
-    rotate_log,
-    start_program,
-)
-from rmpa.runtime.tasks import OwnedTasks, end_tasks, start_task
+from rmpa.runtime import programs
+from rmpa.runtime.programs import NodeRun, ProgramMark, ResourceRun, how_ended
+from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
-    from rmpa.resource.declare import ManagedNode
     from rmpa.resource.quality import Value
-    from rmpa.resource.runtime import Runtime
 
 _log = logging.getLogger(__name__)
 # Seconds between two looks whether a starting node is up, and whether a node is back that is not started here.
@@ -96,10 +84,10 @@ class Processes(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, directory: Path | None) -> None:
+        super().__init__(runtime)
         resource = runtime.resource
-        self._runtime = runtime
-        self._record = directory / RUNS / f"{resource.name}.json" if directory is not None else None
-        logs = directory / LOGS if directory is not None else None
+        self._record = directory / programs.RUNS / f"{resource.name}.json" if directory is not None else None
+        logs = directory / programs.LOGS if directory is not None else None
         self._nodes: dict[str, _Supervised] = {}
         for key, declared in resource.nodes.items():
             log = logs / f"{resource.name}.{key}.log" if logs is not None else None
@@ -110,7 +98,6 @@ class Processes(RuntimePart):
         self._wanted: set[str] = set()
         # Called when a wanted node has ended (true), and when it runs again (false), with a text for people.
         self.on_change: Callable[[ManagedNode, str, bool], None] = lambda _node, _text, _ended: None
-        self._work = OwnedTasks()
         self._writes = asyncio.Lock()
         self._noted: ResourceRun | None = None
         self._complained = False
@@ -126,14 +113,14 @@ class Processes(RuntimePart):
                 _log.info("= %s: node %s (process %d) goes on", self._runtime.node.name, one.node, one.pid)
                 node.adopt(one)
             else:
-                await end_program(one.mark, limits.NODE_END_TIMEOUT)
+                await programs.end_program(one.mark, limits.NODE_END_TIMEOUT)
         await self.note()
 
     async def close(self) -> None:
         """End what was started here."""
         await asyncio.gather(*(node.down() for node in self._nodes.values()))
         await self.note(LifecycleState.FINALIZED)
-        await self._work.close()
+        await super().close()
 
     async def require(self, keys: Collection[str]) -> None:
         """Wait until exactly these nodes are up, of those that profiles name, and all that always run.
@@ -164,7 +151,7 @@ class Processes(RuntimePart):
         node.arguments.update(args)
         if key not in self._wanted:
             return
-        if not node.own and node.state is NodeState.RUNNING:
+        if not node.own and node.run.state == NodeState.RUNNING:
             problem = f"runs, and was not started by {self._runtime.resource.name}"
             raise NodeFailed(f"node {node.declared.name}", problem, "end it: the resource then starts it itself")
         await node.down()
@@ -172,39 +159,28 @@ class Processes(RuntimePart):
 
     def pid(self, key: str) -> int | None:
         """The process of a node; ``None``: it does not run."""
-        node = self._nodes[key]
-        return node.pid if node.state is NodeState.RUNNING else None
+        run = self._nodes[key].run
+        return run.pid or None if run.state == NodeState.RUNNING else None
 
     def problems(self) -> tuple[list[str], list[str]]:
         """The wanted nodes that do not run."""
-        wanted = (node for key, node in self._nodes.items() if key in self._wanted)
-        return [], [
-            f"node {node.declared.name} {node.why}"
-            for node in wanted
-            if node.state in (NodeState.WAITING, NodeState.FAILED)
-        ]
+        wanted = (node.run for key, node in self._nodes.items() if key in self._wanted)
+        lost = (NodeState.WAITING, NodeState.FAILED)
+        return [], [f"node {run.node} {run.why}" for run in wanted if run.state in lost]
 
     def blocked(self) -> dict[str, str]:
         """The profiles whose nodes have failed again and again, with the reason."""
-        failed = {key: node for key, node in self._nodes.items() if node.gave_up}
-        found = {}
-        for name, profile in self._runtime.resource.profiles.items():
-            for key in profile.nodes:
-                if key in failed:
-                    found[name] = f"node {failed[key].declared.name} {failed[key].why}"
-        return found
+        failed = {key: f"node {node.run.node} {node.run.why}" for key, node in self._nodes.items() if node.gave_up}
+        profiles = self._runtime.resource.profiles.values()
+        return {one.name: failed[key] for one in profiles for key in one.nodes if key in failed}
 
     def window_ended(self, measured: Mapping[str, Value]) -> None:  # noqa: ARG002 - the time is what counts
         """Note what has changed, and rotate the logs."""
         self.note_soon()
         if self._nodes and time.monotonic() - self._rotated >= runtime_limits.PROGRAM_LOG_LOOK:
             self._rotated = time.monotonic()
-            self._work.start(asyncio.to_thread(self._rotate), "rotate logs")
-
-    def _rotate(self) -> None:
-        for node in self._nodes.values():
-            if node.own and node.log is not None:
-                rotate_log(node.log)
+            for log in [node.log for node in self._nodes.values() if node.own and node.log is not None]:
+                self._work.start(asyncio.to_thread(programs.rotate_log, log), "rotate a log")
 
     def note_soon(self) -> None:
         """Note the present state in the file of the resource's run."""
@@ -230,7 +206,7 @@ class Processes(RuntimePart):
     def _run(self, state: LifecycleState | None = None) -> ResourceRun:
         mark = ProgramMark.of(os.getpid())
         assert mark is not None  # noqa: S101 - this process runs
-        nodes = tuple(node.run() for node in self._nodes.values())
+        nodes = tuple(node.run for node in self._nodes.values())
         return ResourceRun(process=mark, state=state or self._runtime.state, nodes=nodes)
 
 
@@ -249,17 +225,12 @@ class _Supervised:
         self.log = log
         # Arguments of the launch file beside the declared ones.
         self.arguments: dict[str, str] = {}
-        self.state = NodeState.STOPPED
-        self.pid: int | None = None
-        self.restarts = 0
-        self.since = 0.0
-        self.why = ""
-        self._problem = ""
+        # What is known of it, as the file of the run has it; ``mark`` is of the program that was started for
+        # it, by this run or an earlier one.
+        self.run = NodeRun(key=declared.key, node=declared.name, state=NodeState.STOPPED)
         self._uri = ""
         self._owner = owner
         self._runtime = runtime
-        # The program that was started for it, by this run of the resource or an earlier one.
-        self._mark: ProgramMark | None = None
         self._process: subprocess.Popen[bytes] | None = None  # ``None`` for one of an earlier run
         self._keeper: asyncio.Task[None] | None = None
         self._one = asyncio.Lock()
@@ -271,30 +242,17 @@ class _Supervised:
     @property
     def own(self) -> bool:
         """Whether it was started by the resource."""
-        return self._mark is not None
+        return self.run.mark is not None
 
     @property
     def gave_up(self) -> bool:
         """Whether it has failed so often that no profile shall need it for a while."""
-        failed = self.state is NodeState.FAILED and self._failures >= limits.NODE_FAILURES_MAX
+        failed = self.run.state == NodeState.FAILED and self._failures >= limits.NODE_FAILURES_MAX
         return failed and time.monotonic() - self._given_up < limits.NODE_BLOCKED
-
-    def run(self) -> NodeRun:
-        """It, for the file of the resource's run."""
-        return NodeRun(
-            key=self.declared.key,
-            node=self.declared.name,
-            state=self.state,
-            pid=self.pid or 0,
-            mark=self._mark,
-            restarts=self.restarts,
-            since=self.since,
-            why=self.why,
-        )
 
     def adopt(self, former: NodeRun) -> None:
         """Take over what an earlier run has started."""
-        self._mark, self.pid, self.restarts = former.mark, former.pid or None, former.restarts
+        self._note(mark=former.mark, restarts=former.restarts)
 
     async def up(self) -> None:
         """Wait until it is up; it is started if it does not run.
@@ -303,7 +261,7 @@ class _Supervised:
             PeerRefused: It does not come up.
         """
         async with self._one:
-            if self.state is NodeState.RUNNING and self._keeper is not None:
+            if self.run.state == NodeState.RUNNING and self._keeper is not None:
                 return
             await end_tasks(self._keeper)
             self._keeper = None
@@ -318,13 +276,13 @@ class _Supervised:
             await self._end()
             self._set(NodeState.STOPPED)
 
-    def _set(self, state: NodeState, why: str = "") -> None:
-        self.state, self.why = state, why
-        if state is NodeState.RUNNING:
-            about = figures(self.pid) if self.pid is not None else None
-            self.since = about.since if about is not None else time.time()
-        else:
-            self.pid, self.since = None, 0.0
+    def _set(self, state: NodeState, why: str = "", pid: int = 0) -> None:
+        about = programs.figures(pid) if pid else None
+        since = about.since if about is not None else time.time() if pid else 0.0
+        self._note(state=state, why=why, pid=pid, since=since)
+
+    def _note(self, **facts: object) -> None:
+        self.run = msgspec.structs.replace(self.run, **facts)
         self._owner.note_soon()
 
     async def _begin(self) -> None:
@@ -337,23 +295,22 @@ class _Supervised:
         self._set(NodeState.STARTING)
         try:
             pid = await self._find()
-            if self._mark is not None and not self._mark.runs:
-                self._mark = None
-            if pid is None and self._mark is not None:
+            if self.run.mark is not None and not self.run.mark.runs:
+                self._note(mark=None)
+            if pid is None and self.own:
                 pid = await self._wait()  # of an earlier run, or of an attempt that was given up
             elif pid is None and self.declared.started:
                 pid = await self._start()
             elif pid is None:
                 remedy = "start it, or say in the file how it is started: run, launch or command"
                 raise self._refused("does not run", remedy)
-        except PeerRefused:
+        except PeerRefused as error:
             self._failures += 1
             self._given_up = time.monotonic()
-            self._set(NodeState.FAILED, self._problem)
+            self._set(NodeState.FAILED, error.reason)
             raise
-        self.pid = pid
-        self._set(NodeState.RUNNING)
-        how = "was started" if self._mark is not None else "runs already, and is left alone at the end"
+        self._set(NodeState.RUNNING, pid=pid)
+        how = "was started" if self.own else "runs already, and is left alone at the end"
         _log.info("= %s: node %s (process %d) %s", self._runtime.node.name, name, pid, how)
 
     async def _start(self) -> int:
@@ -386,9 +343,9 @@ class _Supervised:
     async def _spawn(self, command: list[str], environ: Mapping[str, str]) -> None:
         """Start the process, and note it; not to be cancelled in between."""
         self._process = await asyncio.to_thread(
-            start_program, command, log=self.log, cwd=self._runtime.resource.folder, env=environ
+            programs.start_program, command, log=self.log, cwd=self._runtime.resource.folder, env=environ
         )
-        self._mark = ProgramMark.of(self._process.pid)
+        self._note(mark=ProgramMark.of(self._process.pid))
         await self._owner.note()
 
     async def _wait(self) -> int:
@@ -396,7 +353,7 @@ class _Supervised:
         loop = asyncio.get_running_loop()
         until = loop.time() + limits.NODE_START_TIMEOUT
         while (pid := await self._find()) is None:
-            if self._mark is None or not self._mark.runs:
+            if self.run.mark is None or not self.run.mark.runs:
                 why = f"{how_ended(self._code())} before it was registered by this name"
                 raise self._refused(why + await self._log_end())
             if loop.time() > until:
@@ -436,19 +393,19 @@ class _Supervised:
                 text += f", and is not started again ({final})"
                 self._given_up = time.monotonic()
             self._set(NodeState.FAILED if final else NodeState.WAITING, text + await self._log_end())
-            _log.warning("! %s: node %s %s [node-gone]", self._runtime.node.name, self.declared.name, self.why)
-            self._owner.on_change(self.declared, f"node {self.declared.name} {self.why}", True)
+            _log.warning("! %s: node %s %s [node-gone]", self._runtime.node.name, self.declared.name, self.run.why)
+            self._owner.on_change(self.declared, f"node {self.declared.name} {self.run.why}", True)
             await self._end()  # roslaunch, whose node has ended; what is left of its group
             if final or not await self._again_up(delay):
                 return
-            self.restarts += own
+            self._note(restarts=self.run.restarts + own)
             self._owner.on_change(self.declared, f"node {self.declared.name} runs again", False)
 
     async def _again_up(self, delay: float) -> bool:
         """Wait until it runs again; false: it is given up."""
         while True:
             await asyncio.sleep(delay)
-            own, why = self.declared.started, self.why
+            own, why = self.declared.started, self.run.why
             with contextlib.suppress(PeerRefused):
                 await self._begin()
                 return True
@@ -471,12 +428,13 @@ class _Supervised:
 
     async def _gone(self) -> int | None:
         """Wait until its process has ended; return the exit code, if it is known."""
-        pids = {pid for pid in (self.pid, self._mark.pid if self._mark is not None else None) if pid is not None}
-        if self._mark is None and not self._is_local():
+        pids = {pid for pid in (self.run.pid, self.run.mark.pid if self.run.mark is not None else 0) if pid}
+        host = host_of(self._uri)
+        if not (self.own or is_loopback(host) or host in local_addresses() or is_own_name(host)):
             while await self._find() is not None or await self._find() is not None:  # noqa: ASYNC110 - another machine
                 await asyncio.sleep(_BACK)
             return None
-        waits = [start_task(ended(pid), f"end of process {pid}") for pid in pids]
+        waits = [start_task(programs.ended(pid), f"end of process {pid}") for pid in pids]
         try:
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
             await asyncio.wait(waits, timeout=_BACK)  # a script that has run the node ends behind it, with its code
@@ -484,33 +442,27 @@ class _Supervised:
             await end_tasks(*waits)
         return self._code()
 
-    def _is_local(self) -> bool:
-        """Whether its process is one of this machine."""
-        host = host_of(self._uri)
-        return is_loopback(host) or host in local_addresses() or is_own_name(host)
-
     def _code(self) -> int | None:
         return self._process.poll() if self._process is not None else None
 
     async def _end(self) -> None:
         """End what was started for it."""
-        if self._mark is not None:
-            await end_program(self._mark, self.declared.stop_after)
-            self._mark = None
+        if self.run.mark is not None:
+            await programs.end_program(self.run.mark, self.declared.stop_after)
+            self._note(mark=None)
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):  # it is reaped
                 await asyncio.to_thread(self._process.wait, limits.NODE_END_TIMEOUT)
             self._process = None
 
     def _refused(self, why: str, remedy: str = "") -> NodeFailed:
-        self._problem = why
         return NodeFailed(f"node {self.declared.name}", why, remedy, code="resource-trouble")
 
     async def _log_end(self) -> str:
         """The end of its log, for texts."""
         if self.log is None or not self.own:
             return ""
-        lines, _ = await asyncio.to_thread(read_log, self.log, None, _LOG_SHOWN)
+        lines, _ = await asyncio.to_thread(programs.read_log, self.log, None, _LOG_SHOWN)
         told = " / ".join(line for line in lines if line.strip() and not line.startswith(_EMPTY))
         return f"; its log ends: {told[-_LOG_TEXT:]}" if told else ""
 

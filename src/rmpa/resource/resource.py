@@ -20,39 +20,25 @@ from __future__ import annotations
 
 import inspect
 import math
-import shlex
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import is_legal_name
-from rmpa.resource.declaration import ResourceDeclaration
-from rmpa.resource.declare import (
-    AdaptationSettings,
-    AlarmRule,
-    Binding,
-    Context,
-    DeclaredAttribute,
-    Demand,
-    Hook,
-    Input,
-    ManagedNode,
-    Measure,
-    OfferSource,
-    OnFailure,
-    Output,
-    Parameter,
-    ParameterValue,
-    Profile,
-    Task,
-    check_arity,
-    read_contract,
-    read_enum,
-)
+from rmpa.resource import declare
+from rmpa.resource.adaptation import AdaptationSettings
+from rmpa.resource.decision import OfferSource, Profile
+from rmpa.resource.declare import AlarmRule, Context, DeclaredAttribute, Demand, Input, Output, Parameter, Role, Task
+from rmpa.resource.expression import Expression, parse_expression
 from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scale, find_attribute, quantity
+from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rmpa.resource.declare import Binding, Hook, ManagedNode, ParameterValue
     from rmpa.resource.quality import QoSRequest
 
 # The highest rate of a periodic task, in Hz.
@@ -68,13 +54,10 @@ RESERVED: Final = frozenset(
 )  # fmt: skip
 # Keys of requirements and quality reports that cannot be names of attributes.
 NOT_ATTRIBUTES: Final = frozenset({"expires", "level_for", "priority", "profile", "reaction"})
-# The least value in seconds of each time of the control loop.
-_LEAST: Final = {"window": 0.05, "dwell": 0.0, "settle": 0.0, "cool_down": 0.0, "apply_timeout": 0.01}
-_DAY: Final = 86400
 
 
-class Resource(ResourceDeclaration):
-    """The declaration of one Smart Resource.
+class Resource:
+    """The declaration of one Smart Resource. Its tables have the parts in the order in which they were declared.
 
     Args:
         name: A ROS base name; the resource's node is ``/<name>``.
@@ -85,6 +68,96 @@ class Resource(ResourceDeclaration):
     Raises:
         ConfigError: The name is illegal or the role is unknown.
     """
+
+    def __init__(self, name: str, *, role: str, physical: bool = True, description: str = "") -> None:
+        if not name or not is_legal_name(name) or "/" in name or name.startswith("~"):
+            raise ConfigError("resource", f"{name!r} is not a ROS base name", "letters, digits and _, a letter first")
+        if role not in set(Role):
+            remedy = suggestion(role, list(Role), f"it is one of {', '.join(Role)}")
+            raise ConfigError(f"resource {name}", f"there is no role {role!r}", remedy)
+        self.name = name
+        self.role = Role(role)
+        self.physical = physical
+        self.description = description
+        self.outputs: dict[str, Output] = {}
+        self.inputs: dict[str, Input] = {}
+        self.parameters: dict[str, Parameter] = {}
+        self.declared_attributes: dict[str, DeclaredAttribute] = {}
+        self.profiles: dict[str, Profile] = {}
+        self.contexts: dict[str, Context] = {}
+        self.tasks: dict[str, Task] = {}
+        self.demands: dict[str, Demand] = {}
+        self.hooks: dict[str, Hook] = {}
+        # Nodes that exist without the resource, by their declared names.
+        self.nodes: dict[str, ManagedNode] = {}
+        self.alarms: dict[str, AlarmRule] = {}
+        self.start = StartRule()
+        # Base name of the file that declares it; empty: unknown.
+        self.file = ""
+        # The folder of the file that declares it, in which its nodes are started; ``None``: that of the process.
+        self.folder: Path | None = None
+        # Parameters of the control loop.
+        self.settings = AdaptationSettings()
+
+    @property
+    def bound(self) -> dict[str, Binding]:
+        """Where other nodes have the values of parameters, by parameter."""
+        return {name: one.binding for name, one in self.parameters.items() if one.binding is not None}
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The prefix of the measured attributes of each output and input, by name, outputs first.
+
+        The prefix is the last part of the name; if that is taken, as many last parts as make it unique, joined by
+        dots; if all are taken, the whole name after ``in.`` or ``out.``.
+        """
+        topics = self.outputs | self.inputs
+        found = {name: topic.label for name, topic in topics.items() if topic.label}
+        for name in (name for name in topics if name not in found):
+            parts = name.strip("/").split("/")
+            several = [".".join(parts[-count:]) for count in range(1, len(parts) + 1)]
+            several.append(f"{'in' if name in self.inputs else 'out'}.{several[-1]}")
+            found[name] = next((label for label in several if label not in found.values()), several[-1])
+        return {name: found[name] for name in topics}
+
+    @property
+    def attributes(self) -> dict[str, Attribute]:
+        """All attributes that clients may request: the declared ones, and those measured of each output and input.
+
+        ``rate`` is that of the first output; ``scan.rate`` names the output or input by its label (``labels``).
+        """
+        found: dict[str, Attribute] = {}
+        for position, label in enumerate(self.labels.values()):
+            for key, attribute in MEASURED.items():
+                if position == 0 and self.outputs:
+                    found[key] = attribute
+                found[f"{label}.{key}"] = attribute
+        return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
+
+    def expression(self, text: str, where: str) -> Expression:
+        """Parse an expression over the resource's topics, parameters, attributes and ``expression.SOURCES``.
+
+        Raises:
+            ConfigError: It is invalid, or names a node that is not declared; ``where`` begins the error's text.
+        """
+        parsed = parse_expression(text, self.parameters, where, attributes=self.attributes)
+        for source in parsed.sources.values():
+            if source.function not in ("cpu", "memory", "running"):
+                continue
+            if not source.arguments and len(self.nodes) != 1:
+                raise ConfigError(where, f"{source.function}() of which node?", f"there are {len(self.nodes)}")
+            declare.check_known("node", source.arguments[:1], self.nodes, where)
+        return parsed
+
+    def expressions(self) -> Iterator[tuple[tuple[str, str, str], Expression]]:
+        """All expressions of the declaration; each with its kind, its name and its key, as in a description."""
+        rules = (
+            *(("context", one.name, "when", one.when) for one in self.contexts.values()),
+            *(("alarm", one.name, "when", one.when) for one in self.alarms.values()),
+            *(("profile", one.name, "needs", one.rule) for one in self.profiles.values()),
+            *(("attribute", name, "value", one.value) for name, one in self.declared_attributes.items()),
+        )
+        return (((kind, name, key), rule) for kind, name, key, rule in rules if rule is not None)
 
     def output(
         self,
@@ -114,10 +187,10 @@ class Resource(ResourceDeclaration):
             ConfigError: The name is illegal or taken, or the contract has an unknown key or an invalid value.
             DefinitionError: The type's name is malformed, or its package is known and has no such type.
         """
-        where = self._check_topic("output", name, self.outputs, self.inputs)
-        made = Output(name, kind, read_contract(where, contract), self._check_label(where, label))
+        where = self._check_topic("output", name, label)
+        made = Output(name, kind, declare.read_contract(where, contract), label)
         made.latch, made.observed = latch, observed
-        made.measure = read_enum(Measure, measure, where)
+        made.measure = declare.read_enum(declare.Measure, measure, where)
         self.outputs[name] = made
         return made
 
@@ -137,8 +210,8 @@ class Resource(ResourceDeclaration):
         ``required``: whether the resource is stale while the topic has no publisher. ``observed``: another node
         receives it; the resource only looks whether it is published.
         """
-        where = self._check_topic("input", name, self.inputs, self.outputs)
-        made = Input(name, kind, read_contract(where, contract), self._check_label(where, label))
+        where = self._check_topic("input", name, label)
+        made = Input(name, kind, declare.read_contract(where, contract), label)
         made.required, made.observed = required, observed
         self.inputs[name] = made
         return made
@@ -184,12 +257,11 @@ class Resource(ResourceDeclaration):
                 the binding names no declared node.
         """
         where = self._check_name("parameter", name, self.parameters)
-        if binding is not None and binding.node not in self.nodes:
-            remedy = suggestion(binding.node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
-            raise ConfigError(where, f"there is no node {binding.node}", remedy)
-        if binding is not None and binding.kind == "private" and binding.name in self.nodes[binding.node].params:
-            remedy = "leave it out there: default is its first value"
-            raise ConfigError(where, f"{binding.name} is among the params of node {binding.node} too", remedy)
+        if binding is not None:
+            declare.check_known("node", [binding.node], self.nodes, where)
+            if binding.kind == "private" and binding.name in self.nodes[binding.node].params:
+                remedy = "leave it out there: default is its first value"
+                raise ConfigError(where, f"{binding.name} is among the params of node {binding.node} too", remedy)
         made = Parameter(name, default, low, high, tuple(choices), unit, description, binding=binding)
         made.check_declaration(where)
         self.parameters[name] = made
@@ -217,8 +289,8 @@ class Resource(ResourceDeclaration):
             category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
             tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.
             words: The values of ordinal and nominal scales.
-            value: An expression (``resource.expression``) that gives its value at the end of each window, over
-                topics, parameters, ``SOURCES`` and the attributes declared before; empty: ``observe`` gives it.
+            value: An expression (``resource.expression``) that gives its value at the end of each window, over all
+                that was declared before; empty: ``observe`` gives it.
 
         Raises:
             ConfigError: The name is illegal or taken, or the arguments contradict each other.
@@ -232,10 +304,10 @@ class Resource(ResourceDeclaration):
         plain = tolerance if tolerance is None else quantity(tolerance, unit if scale == "linear" else "", where)
         attribute = Attribute(
             name=name,
-            direction=read_enum(Direction, better, where),
+            direction=declare.read_enum(Direction, better, where),
             unit=unit,
-            scale=read_enum(Scale, scale, where),
-            category=read_enum(Category, category, where),
+            scale=declare.read_enum(Scale, scale, where),
+            category=declare.read_enum(Category, category, where),
             tolerance=plain,
             words=tuple(words),
         )
@@ -275,12 +347,12 @@ class Resource(ResourceDeclaration):
                 best-effort profile already.
         """
 
-        def declare(function: _Function) -> _Function:
+        def decorate(function: _Function) -> _Function:
             title = name or function.__name__
             where = self._new("profile", title, self.profiles)
-            check_arity(function, 0, where)
+            declare.check_arity(function, 0, where)
             if needs is not None:
-                check_arity(needs, 0, f"the precondition of {where}")
+                declare.check_arity(needs, 0, f"the precondition of {where}")
                 if inspect.iscoroutinefunction(needs):
                     raise ConfigError(where, "its precondition is a coroutine function", "make it a plain one")
             if not (math.isfinite(cost) and cost >= 0):
@@ -296,27 +368,15 @@ class Resource(ResourceDeclaration):
             }
             text = description or (function.__doc__ or "").strip().partition("\n")[0]
             given = {key: self._parameter_value(key, value, where) for key, value in (sets or {}).items()}
-            for node in nodes:
-                if node not in self.nodes:
-                    remedy = suggestion(node, self.nodes, f"declared are {', '.join(self.nodes) or 'none'}")
-                    raise ConfigError(where, f"there is no node {node}", remedy)
-            if rule:
-                self.expression(rule, where)
+            declare.check_known("node", nodes, self.nodes, where)
+            parsed = self.expression(rule, where) if rule else None
+            apply = cast("Hook", function)
             self.profiles[title] = Profile(
-                title,
-                values,
-                cost,
-                best_effort,
-                text,
-                function,  # type: ignore[arg-type] # check_arity
-                needs,
-                given,
-                tuple(nodes),
-                rule,
+                title, values, cost, best_effort, text, apply, needs, given, tuple(nodes), parsed
             )
             return function
 
-        return declare
+        return decorate
 
     def context(
         self,
@@ -337,18 +397,14 @@ class Resource(ResourceDeclaration):
                 rule is invalid.
         """
         where = self._new("context", name, self.contexts)
-        for profile in profiles:
-            if profile not in self.profiles:
-                remedy = suggestion(profile, self.profiles, "declare the profile before the context")
-                raise ConfigError(where, f"there is no profile {profile}", remedy)
+        declare.check_known("profile", profiles, self.profiles, where, "declare the profile before the context")
         for key, request in (requires or {}).items():
             request.bound(find_attribute(self.attributes, key, self.name))
         if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
             raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
-        if when:
-            self.expression(when, where)
+        rule = self.expression(when, where) if when else None
         names = tuple(output.name for output in outputs) if outputs is not None else None
-        made = self.contexts[name] = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
+        made = self.contexts[name] = Context(name, rule, dict(requires or {}), tuple(profiles), names, enter)
         return made
 
     def node(self, key: str, name: str = "", **how: Any) -> ManagedNode:
@@ -363,24 +419,10 @@ class Resource(ResourceDeclaration):
             ConfigError: A name is illegal or taken, or there are several ways to start it.
         """
         where = self._new("node", key, self.nodes)
-        made = ManagedNode(key, name or f"/{key}", **how)
-        if not key or not is_legal_name(key) or "/" in key or key.startswith("~"):
-            raise ConfigError(where, f"{key!r} is not a base name", "letters, digits and _, a letter first")
-        if not made.name.startswith("/") or not is_legal_name(made.name) or made.name == "/":
-            raise ConfigError(where, f"{made.name!r} is not a global name of a node", f"for example /{key}")
+        made = declare.ManagedNode(key, name or f"/{key}", **how)
+        made.check(where)
         if any(other.name == made.name for other in self.nodes.values()) or made.name == f"/{self.name}":
             raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
-        if sum(map(bool, (made.run, made.launch, made.command))) > 1:
-            raise ConfigError(where, "run, launch and command are three ways to start it", "keep one of them")
-        if made.server and (not made.server.startswith("/") or not is_legal_name(made.server)):
-            raise ConfigError(where, f"{made.server!r} is not a global name", f"for example {made.name}/debayer")
-        for text, least in ((made.run, 2), (made.launch, 1)):
-            try:
-                enough = not text or len(shlex.split(text)) >= least
-            except ValueError:  # a quote is not closed
-                enough = False
-            if not enough:
-                raise ConfigError(where, f"{text!r} does not name a program", "write PACKAGE NAME, as for rosrun")
         self.nodes[key] = made
         return made
 
@@ -389,7 +431,7 @@ class Resource(ResourceDeclaration):
 
         Args:
             name: Unique within the resource.
-            when: The rule, over topics, parameters, ``SOURCES`` and attributes.
+            when: The rule (``resource.expression``).
             level: ``warn`` or ``error``.
             text: What people read; by default the rule.
 
@@ -399,8 +441,7 @@ class Resource(ResourceDeclaration):
         where = self._new("alarm", name, self.alarms)
         if level not in ("warn", "error"):
             raise ConfigError(where, f"there is no level {level!r}", "it is warn or error")
-        self.expression(when, where)
-        made = self.alarms[name] = AlarmRule(name, when, level == "error", text)
+        made = self.alarms[name] = AlarmRule(name, self.expression(when, where), level == "error", text)
         return made
 
     def task(
@@ -426,14 +467,17 @@ class Resource(ResourceDeclaration):
                 parameter is another resource's.
         """
 
-        def declare(function: _Function) -> _Function:
+        def decorate(function: _Function) -> _Function:
             title = name or function.__name__
             where = self._new("task", title, self.tasks)
             if (rate is None) == (on is None):
                 raise ConfigError(where, "it needs either a rate or an input", 'rate="10 Hz", or on=an input')
             rate_parameter, hertz = None, None
             if isinstance(rate, Parameter):
-                self._check_rate(rate, where)
+                if rate not in self.parameters.values():
+                    problem = f"{rate.name} is no parameter of this resource"
+                    raise ConfigError(where, problem, "declare it there first")
+                rate.check_rate(_RATE_MAX, where)
                 rate_parameter, hertz = rate, float(rate.default)
             elif rate is not None:
                 hertz = quantity(rate, "Hz", where)
@@ -442,14 +486,14 @@ class Resource(ResourceDeclaration):
             if on is not None and on not in self.inputs.values():
                 raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
             seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
-            check_arity(function, 1 if on is not None else 0, where)
+            declare.check_arity(function, 1 if on is not None else 0, where)
             if seconds is not None and seconds <= 0:
                 raise ConfigError(where, f"stuck after {seconds:g} s", "it is above 0")
-            policy = read_enum(OnFailure, on_failure, where)
+            policy = declare.read_enum(declare.OnFailure, on_failure, where)
             self.tasks[title] = Task(title, function, hertz, on, policy, seconds, rate_parameter)  # type: ignore[arg-type] # check_arity
             return function
 
-        return declare
+        return decorate
 
     def adaptation(
         self,
@@ -483,17 +527,14 @@ class Resource(ResourceDeclaration):
             ConfigError: A time is out of range, or ``violations`` is greater than ``windows``.
         """
         where = f"adaptation of {self.name}"
-        if not 1 <= violations <= windows <= 100:
-            raise ConfigError(where, f"{violations} of {windows} windows", "1 <= violations <= windows <= 100")
         texts = {"window": window, "dwell": dwell, "settle": settle, "cool_down": cool_down}
         texts |= {"cool_down_max": cool_down_max, "apply_timeout": apply_timeout}
         times = {name: quantity(value, "s", f"{where}, {name}") for name, value in texts.items()}
-        for name, least in _LEAST.items():
-            if not least <= times[name] <= _DAY:
-                raise ConfigError(where, f"{name} is {times[name]:g} s", f"at least {least:g} s, at most a day")
         times["cool_down_max"] = max(times["cool_down_max"], times["cool_down"])
-        source = read_enum(OfferSource, offers, where)
-        self.settings = AdaptationSettings(violations, windows, improvement, **times, offers=source)
+        source = declare.read_enum(OfferSource, offers, where)
+        made = AdaptationSettings(violations, windows, improvement, **times, offers=source)
+        made.check(where)
+        self.settings = made
 
     def on(self, event: str) -> Callable[[_Function], _Function]:
         """Declare the callback of a life-cycle transition.
@@ -511,12 +552,12 @@ class Resource(ResourceDeclaration):
         if event in self.hooks:
             raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
 
-        def declare(function: _Function) -> _Function:
-            check_arity(function, 0, f"what {self.name} does at {event}")
+        def decorate(function: _Function) -> _Function:
+            declare.check_arity(function, 0, f"what {self.name} does at {event}")
             self.hooks[event] = function  # type: ignore[assignment] # check_arity
             return function
 
-        return declare
+        return decorate
 
     def _new(self, kind: str, name: str, known: Mapping[str, object]) -> str:
         """Refuse a name that is taken, and return a description of the declared item for errors."""
@@ -526,33 +567,19 @@ class Resource(ResourceDeclaration):
         return where
 
     def _parameter_value(self, name: str, value: ParameterValue, where: str) -> ParameterValue:
-        if name not in self.parameters:
-            remedy = suggestion(name, self.parameters, f"declared are {', '.join(self.parameters) or 'none'}")
-            raise ConfigError(where, f"there is no parameter {name}", remedy)
+        declare.check_known("parameter", [name], self.parameters, where)
         try:
             return self.parameters[name].check(value)
         except ConfigError as error:
             raise ConfigError(f"{where}, {error.source}", error.problem, error.remedy) from None
 
-    def _check_label(self, where: str, label: str) -> str:
+    def _check_topic(self, kind: str, name: str, label: str) -> str:
+        where = self._check_name(kind, name, self.outputs if kind == "output" else self.inputs)
+        if name in (self.inputs if kind == "output" else self.outputs):
+            problem = f"it is {'an input' if kind == 'output' else 'an output'} of the same resource"
+            raise ConfigError(where, problem, "a global name (/scan) is another topic")
         if label and (not is_legal_name(label) or "/" in label or label in self.labels.values()):
             raise ConfigError(where, f"{label!r} cannot be its label", "letters, digits and _, and none twice")
-        return label
-
-    def _check_rate(self, parameter: Parameter, where: str) -> None:
-        if parameter not in self.parameters.values():
-            raise ConfigError(where, f"{parameter.name} is no parameter of this resource", "declare it there first")
-        low, high = parameter.bounds
-        if parameter.type not in ("int", "double") or not low > 0 or not high <= _RATE_MAX:
-            remedy = f"declare it with low above 0 and high at most {_RATE_MAX:g}"
-            raise ConfigError(where, f"{parameter.name} may be what no rate can be", remedy)
-
-    def _check_topic(self, kind: str, name: str, same: Mapping[str, object], other: Mapping[str, object]) -> str:
-        where = self._check_name(kind, name, same)
-        if name in other:
-            opposite = "an input" if kind == "output" else "an output"
-            remedy = "a global name (/scan) is another topic"
-            raise ConfigError(where, f"it is {opposite} of the same resource", remedy)
         return where
 
     def _check_name(self, kind: str, name: str, known: Mapping[str, object]) -> str:

@@ -9,34 +9,24 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from contextvars import ContextVar
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from rmpa.core.contract import DEFAULT_CONTRACT, KEYS
 from rmpa.core.errors import RmpaError
 from rmpa.resource import limits
-from rmpa.ros.types.descriptor import (
-    TOPIC,
-    AttributeDescriptor,
-    ContextDescriptor,
-    DemandDescriptor,
-    Descriptor,
-    NodeDescriptor,
-    ParameterDescriptor,
-    ProfileDescriptor,
-    TaskDescriptor,
-    TopicDescriptor,
-)
+from rmpa.resource.functions import CALLER
+from rmpa.ros.types import descriptor
 from rmpa.ros.types.messages import HeaderNumbers, MessageError, MessageType
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.resource.declare import DeclaredTopic, Input, Output, Parameter
+    from rmpa.resource.declare import DeclaredTopic, Output, Parameter
     from rmpa.resource.quality import Value
     from rmpa.resource.resource import Resource
     from rmpa.ros.node.endpoints import Publisher, Received, Subscriber
@@ -44,10 +34,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _CLOSED: Final = "life cycle"
-_Kind = TypeVar("_Kind", bound=msgspec.Struct)
-# ``profile`` or ``context`` in such a function and in the coroutines, tasks and ``asyncio.to_thread`` calls that it
-# begins; else empty.
-CALLER: ContextVar[str] = ContextVar("caller", default="")
 
 
 class LifecycleState(StrEnum):
@@ -72,19 +58,23 @@ class LifecycleState(StrEnum):
 
 
 class RuntimePart:
-    """Base of the parts of a running resource. The callbacks do nothing here; all are called in the event loop."""
+    """Base of the parts of a running resource. The callbacks do nothing here; all are called in the event loop.
+
+    Args:
+        runtime: The runtime of the resource.
+    """
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        # What the part does by itself; it ends with the part.
+        self._work = OwnedTasks()
 
     async def start(self) -> None:
         """Start the part: the node is registered and the outputs are advertised; tasks do not run yet."""
 
     async def close(self) -> None:
         """End the part: the resource ends; the node is still registered."""
-
-    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:
-        """An output has sent a message; ``caller``: of an observed one, the node that has."""
-
-    def received(self, item: Input, message: Received) -> None:
-        """An input has received a message."""
+        await self._work.close()
 
     def parameter_changed(self, parameter: Parameter) -> None:
         """A parameter's value has changed."""
@@ -99,6 +89,10 @@ class RuntimePart:
         """Problems apart from the quality, as texts: first what is missing, second what does not work."""
         return [], []
 
+    def blocked(self) -> dict[str, str]:
+        """The profiles that cannot run at present, with the reasons."""
+        return {}
+
 
 class Runtime:
     """Runs one resource on a node: connects its declaration, its topics and its parts.
@@ -111,14 +105,17 @@ class Runtime:
     def __init__(self, resource: Resource, node: Node) -> None:
         self.resource = resource
         self.node = node
+        # In the order of their start.
         self.parts: list[RuntimePart] = []
         self.state = LifecycleState.UNCONFIGURED
-        # Called in the event loop with each value that the user's code has observed.
-        self.on_observation: Callable[[str, Value], None] = lambda _attribute, _value: None
+        # Called in the event loop with each message that an output has sent or that was received: ``(topic, bytes,
+        # Unix nanoseconds, received message)``; the last is ``None`` for an output of the resource itself.
+        self.listeners: list[Callable[[DeclaredTopic, bytes, int, Received | None], None]] = []
         # The only outputs that are published in the present context; ``None``: all.
         self.context_outputs: tuple[str, ...] | None = None
         self._publishers: dict[str, Publisher] = {}
-        self._subscribers: dict[str, Subscriber] = {}
+        # Those of inputs and observed outputs, by the declared name.
+        self.subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
         self._held: deque[tuple[Output, bytes, str]] = deque()
         self._held_bytes = 0
@@ -130,54 +127,58 @@ class Runtime:
         self._unusable: set[tuple[str, str]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
-        self._undo = contextlib.AsyncExitStack()
+        # What is undone at the end, and where the start fails.
+        self.undo = contextlib.AsyncExitStack()
 
-    async def start(self, parts: Iterable[RuntimePart] = (), *first: Callable[[], Awaitable[None]]) -> None:
-        """Register the node, its outputs and inputs, and start the parts in the given order.
+    async def start(self, *first: Callable[[], Awaitable[None]]) -> None:
+        """Register the node, its outputs and inputs, and start the parts.
 
         Args:
-            parts: The parts of the resource.
             first: Called one after the other before the parts start.
 
         Raises:
             UnreachableError: The master does not answer.
             PeerRefused: The master refuses a registration.
         """
-        self.parts = list(parts)
         self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
-        async with contextlib.AsyncExitStack() as undo:
-            await undo.enter_async_context(self.node)
-            for output in self.resource.outputs.values():
-                if output.observed:
-                    continue
-                topic = topic_of(output.name, self.node.name)
-                self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
-                output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
-                undo.callback(setattr, output, "on_publish", None)
-            for declared in self.resource.declared_attributes.values():
-                declared.on_observation = functools.partial(self.call_in_loop, self._observed)
-                undo.callback(setattr, declared, "on_observation", None)
-            for parameter in self.resource.parameters.values():
-                parameter.on_change = functools.partial(self.call_in_loop, self._parameter_changed)
-                undo.callback(setattr, parameter, "on_change", None)
-            for name in (TOPIC, "state", "profile", "decision", "context"):
-                kind = MessageType("std_msgs/String")
-                publisher = await self.node.advertise(f"{self.node.name}/{name}", kind, latch=True)
-                self._texts[name] = publisher, None
-            self.publish_descriptor()
-            for item in self.resource.inputs.values():
-                if not item.observed:
-                    await self._receive(item)
+        try:
+            await self.undo.enter_async_context(self.node)
+            await self._open_topics()
             for step in first:
                 await step()
             for part in self.parts:
                 await part.start()
-                undo.push_async_callback(part.close)
-            self._undo = undo.pop_all()
+                self.undo.push_async_callback(part.close)
+        except BaseException:
+            await self.close()
+            raise
+
+    async def _open_topics(self) -> None:
+        for output in self.resource.outputs.values():
+            if not output.observed:
+                topic = topic_of(output.name, self.node.name)
+                self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
+                output.on_publish = functools.partial(self._publish, output, HeaderNumbers(output.type))
+                self.undo.callback(setattr, output, "on_publish", None)
+        for parameter in self.resource.parameters.values():
+            self.bind(parameter, "on_change", self._parameter_changed)
+        for name in (descriptor.TOPIC, "state", "profile", "decision", "context"):
+            kind = MessageType("std_msgs/String")
+            publisher = await self.node.advertise(f"{self.node.name}/{name}", kind, latch=True)
+            self._texts[name] = publisher, None
+        self.publish_descriptor()
+        for item in self.resource.inputs.values():
+            if not item.observed:
+                await self.receive(item)
 
     async def close(self) -> None:
         """Close the parts in reverse order of their start, then the node."""
-        await self._undo.aclose()
+        await self.undo.aclose()
+
+    def bind(self, declared: object, field: str, function: Callable[..., None]) -> None:
+        """Have a declared thing call a function in the event loop, until the resource ends."""
+        setattr(declared, field, functools.partial(self.call_in_loop, function))
+        self.undo.callback(setattr, declared, field, None)
 
     def publish_text(self, name: str, text: str) -> None:
         """Publish a text on one of the resource's latched topics ``std_msgs/String``, if it differs from the last."""
@@ -188,7 +189,7 @@ class Runtime:
 
     def publish_descriptor(self) -> None:
         """Publish the descriptor, at the start and after the declaration has changed."""
-        self.publish_text(TOPIC, describe(self.resource, self.node.name).serialize())
+        self.publish_text(descriptor.TOPIC, describe(self.resource, self.node.name).serialize())
 
     def changed(self) -> None:
         """Tell the parts that requirements, profile, context or a choice may have changed."""
@@ -202,7 +203,7 @@ class Runtime:
             for name, item in self.resource.inputs.items()
             if item.required
             and not item.observed
-            and not ((subscriber := self._subscribers.get(name)) and subscriber.publishers)
+            and not ((subscriber := self.subscribers.get(name)) and subscriber.publishers)
         ]
         broken = []
         for part in self.parts:
@@ -215,25 +216,7 @@ class Runtime:
 
     def hears(self, name: str) -> bool:
         """Whether the messages of an input or output, by its declared name, come to the resource itself."""
-        return name in self._publishers or name in self._subscribers
-
-    async def observe(self, output: Output, received: Callable[[Received], None]) -> None:
-        """Subscribe to an observed output; ``received`` is called after the parts."""
-
-        def deliver(message: Received) -> None:
-            for part in self.parts:
-                part.published(output, message.raw, message.stamp_ns, message.caller_id)
-            received(message)
-
-        await self._subscribe(output, deliver)
-
-    def subscriber(self, name: str) -> Subscriber | None:
-        """That of an input or observed output, by its declared name."""
-        return self._subscribers.get(name)
-
-    async def ignore(self, name: str) -> None:
-        """End the subscription to an observed output."""
-        await self._subscribers.pop(name).close()
+        return name in self._publishers or name in self.subscribers
 
     def call_in_loop(self, function: Callable[..., object], *args: Any) -> None:
         """Call a function in the event loop: at once if called in the loop's thread, else as soon as the loop can."""
@@ -243,32 +226,24 @@ class Runtime:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(function, *args)
 
-    def _observed(self, attribute: str, value: Value) -> None:
-        self.on_observation(attribute, value)
-
     def _parameter_changed(self, parameter: Parameter) -> None:
         for part in self.parts:
             part.parameter_changed(parameter)
 
-    async def _receive(self, item: Input) -> None:
-        def deliver(message: Received) -> None:
-            for part in self.parts:
-                part.received(item, message)
-
-        await self._subscribe(item, deliver)
-
-    async def _subscribe(self, item: DeclaredTopic, deliver: Callable[[Received], None]) -> None:
+    async def receive(self, item: DeclaredTopic) -> None:
+        """Subscribe to an input or an observed output; its messages go to the listeners."""
         unknown = item.known is None
 
         def received(message: Received) -> None:
             if not unknown or self._learn(item, message):
-                deliver(message)
+                for listener in self.listeners:
+                    listener(item, message.raw, message.stamp_ns, message)
 
         name, topic = self.node.name, topic_of(item.name, self.node.name)
         if unknown:
             text = "is not known here; a publisher of"
             _log.info("= %s: the type of %s, %s, %s %s tells it", name, item.name, item.type_name, text, topic)
-        self._subscribers[item.name] = await self.node.subscribe(topic, item.known or item.type_name, received)
+        self.subscribers[item.name] = await self.node.subscribe(topic, item.known or item.type_name, received)
 
     def _learn(self, item: DeclaredTopic, message: Received) -> bool:
         """Take the type of a topic from its publisher's header; false if the definition there cannot be used."""
@@ -363,18 +338,18 @@ class Runtime:
             return
         publisher.publish_raw(raw)
         now_ns = time.time_ns()
-        for part in self.parts:
-            part.published(output, raw, now_ns)
+        for listener in self.listeners:
+            listener(output, raw, now_ns, None)
 
 
-def describe(resource: Resource, node: str) -> Descriptor:
+def describe(resource: Resource, node: str) -> descriptor.Descriptor:
     """Make the descriptor of a declared resource.
 
     Args:
         resource: The resource, completely declared.
         node: Global name of the resource's node.
     """
-    return Descriptor(
+    return descriptor.Descriptor(
         name=resource.name,
         node=node,
         role=resource.role.value,
@@ -384,38 +359,39 @@ def describe(resource: Resource, node: str) -> Descriptor:
         inputs=tuple(_topic(item, node, required=item.required) for item in resource.inputs.values()),
         parameters=tuple(_parameter(p) for p in resource.parameters.values()),
         attributes=tuple(
-            AttributeDescriptor(name, a.direction, a.unit, a.scale, a.category, a.tolerance, a.words)
+            descriptor.AttributeDescriptor(name, a.direction, a.unit, a.scale, a.category, a.tolerance, a.words)
             for name, a in resource.attributes.items()
         ),
-        profiles=tuple(_convert(p, ProfileDescriptor) for p in resource.profiles.values()),
+        profiles=tuple(
+            msgspec.convert(p, descriptor.ProfileDescriptor, from_attributes=True) for p in resource.profiles.values()
+        ),
         contexts=tuple(
-            ContextDescriptor(c.name, c.when, {k: str(v) for k, v in c.requires.items()}, c.profiles, c.outputs)
+            descriptor.ContextDescriptor(
+                c.name, str(c.when or ""), {k: str(v) for k, v in c.requires.items()}, c.profiles, c.outputs
+            )
             for c in resource.contexts.values()
         ),
         tasks=tuple(
-            TaskDescriptor(
+            descriptor.TaskDescriptor(
                 t.name, t.rate, t.on.name if t.on else "", t.rate_parameter.name if t.rate_parameter else ""
             )
             for t in resource.tasks.values()
         ),
         asks=tuple(
-            DemandDescriptor(d.resource, {k.replace("__", "."): str(v) for k, v in d.requests.items()}, d.priority)
+            descriptor.DemandDescriptor(
+                d.resource, {k.replace("__", "."): str(v) for k, v in d.requests.items()}, d.priority
+            )
             for d in resource.demands.values()
         ),
-        nodes=tuple(NodeDescriptor(n.key, n.name, n.how) for n in resource.nodes.values()),
+        nodes=tuple(descriptor.NodeDescriptor(n.key, n.name, n.how) for n in resource.nodes.values()),
         file=resource.file,
     )
 
 
-def _parameter(one: Parameter) -> ParameterDescriptor:
+def _parameter(one: Parameter) -> descriptor.ParameterDescriptor:
     binding = str(one.binding) if one.binding is not None else ""
-    values = {name: getattr(one, name) for name in ParameterDescriptor.__struct_fields__}
-    return ParameterDescriptor(**values | {"binding": binding})
-
-
-def _convert(declared: object, kind: type[_Kind]) -> _Kind:
-    """Make a descriptor from a declaration's attributes of the same names."""
-    return msgspec.convert(declared, kind, from_attributes=True)
+    values = {name: getattr(one, name) for name in descriptor.ParameterDescriptor.__struct_fields__}
+    return descriptor.ParameterDescriptor(**values | {"binding": binding})
 
 
 def topic_of(name: str, node: str) -> str:
@@ -423,9 +399,10 @@ def topic_of(name: str, node: str) -> str:
     return name if name.startswith("/") else f"{node}/{name}"
 
 
-def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> TopicDescriptor:
+def _topic(topic: DeclaredTopic, node: str, *, required: bool = True) -> descriptor.TopicDescriptor:
     values = {key: getattr(topic.contract, key) for key in KEYS}
     contract = {key: value for key, value in values.items() if value != getattr(DEFAULT_CONTRACT, key)}
-    observed = getattr(topic, "observed", False)
     full = topic_of(topic.name, node)
-    return TopicDescriptor(topic.name, full, topic.type_name, contract, required, observed, topic.label)
+    return descriptor.TopicDescriptor(
+        topic.name, full, topic.type_name, contract, required, topic.observed, topic.label
+    )

@@ -13,7 +13,7 @@ import logging
 import math
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -21,8 +21,8 @@ import msgspec
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 from rmpa.resource.adaptation import CoolDown
-from rmpa.resource.quality import parse_requirement
-from rmpa.resource.runtime import RuntimePart
+from rmpa.resource.quality import Attribute, Direction, Requirement, Value, find_attribute, parse_requirement
+from rmpa.resource.runtime import Runtime, RuntimePart
 from rmpa.runtime.accept import in_thread
 from rmpa.runtime.files import replace_file, set_aside
 from rmpa.runtime.tasks import start_task
@@ -32,16 +32,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.resource.declare import Parameter
-    from rmpa.resource.quality import Attribute, Requirement
     from rmpa.resource.resource import Resource
-    from rmpa.resource.runtime import Runtime
 
 _log = logging.getLogger(__name__)
 _SECOND: Final = 1_000_000_000
 # Number of consecutive checks without a connection after which a client is gone. One check is not enough: after a
 # short interruption of its link, the connections of a proxy are made again.
 _ABSENT: Final = 2
-
+_WORSE: Final = {Direction.MAX: -1, Direction.MIN: 1}
 
 # The file's form. A release that changes it reads the earlier ones, from 0.2.0 on (docs/reference/compatibility.md).
 FORMAT: Final = 1
@@ -181,7 +179,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
         return found, lost
 
 
-# The clients of a resource. Their last messages, refusals and presence. ``quality.merge`` merges their requirements.
+# The clients of a resource: what they say, and their presence. ``quality.merge`` merges their requirements.
 
 
 @dataclass(slots=True)
@@ -195,6 +193,9 @@ class ClientRecord:
         refusal: Why its last message was refused; empty: it was accepted.
         absent: Number of consecutive checks without a connection.
         grace: For a client restored after a restart: how long it may stay unconnected, in monotonic seconds.
+        observed: The qualities that it has reported last: fewer messages may arrive in another module than were sent,
+            where only the client can measure the loss.
+        observed_at: When it has, in monotonic seconds.
     """
 
     mark: str = ""
@@ -203,6 +204,8 @@ class ClientRecord:
     refusal: str = ""
     absent: int = 0
     grace: float = -math.inf
+    observed: Mapping[str, Value] = field(default_factory=dict)
+    observed_at: float = -math.inf
 
 
 class Clients:
@@ -211,11 +214,14 @@ class Clients:
     Args:
         resource: Name of the resource, for errors.
         attributes: The attributes that clients may request, by name.
+        lifespan: Seconds for which what a client reports counts.
     """
 
-    def __init__(self, resource: str, attributes: Mapping[str, Attribute]) -> None:
+    def __init__(self, resource: str, attributes: Mapping[str, Attribute], lifespan: float = math.inf) -> None:
         self._resource = resource
         self._attributes = attributes
+        # Seconds for which a report of observed qualities counts.
+        self._lifespan = lifespan
         self.known: dict[str, ClientRecord] = {}
         # Expiry in monotonic seconds, by client and stamp: a latched request that arrives again keeps its expiry.
         self.expiries: dict[tuple[str, str], float] = {}
@@ -258,6 +264,48 @@ class Clients:
     def refuse(self, name: str, why: str) -> None:
         """Record why a client's last message was refused."""
         self.known.setdefault(name, ClientRecord()).refusal = why
+
+    def report(self, name: str, values: Iterable[tuple[str, str]], now: float) -> None:
+        """Record the qualities that a client observes, as texts by attribute, in place of its previous report.
+
+        Raises:
+            ConfigError: An attribute is unknown or a value is invalid; the whole report is dropped.
+        """
+        found: dict[str, Value] = {}
+        for number, (key, text) in enumerate(values):
+            where = f"observation of {key}"
+            if number >= limits.REQUIREMENT_BOUNDS_MAX:
+                raise ConfigError(where, f"more than {limits.REQUIREMENT_BOUNDS_MAX} attributes")
+            found[key] = find_attribute(self._attributes, key, self._resource).parse(text, where)
+        client = self.known.setdefault(name, ClientRecord())
+        client.observed, client.observed_at = found, now
+
+    def worst(self, measured: Mapping[str, Value], clients: Collection[str], now: float) -> dict[str, Value]:
+        """For each attribute the worst of the measured and the reported values.
+
+        Args:
+            measured: The resource's own measurements, by attribute.
+            clients: The clients that have a requirement; reports of others do not count.
+            now: Monotonic seconds.
+
+        Returns:
+            Values by attribute. Where no direction is better, a reported value replaces the measured one.
+        """
+        worst = dict(measured)
+        for name, client in self.known.items():
+            if now - client.observed_at > self._lifespan:
+                client.observed = {}
+            for key, value in client.observed.items() if name in clients else ():
+                attribute, known = self._attributes[key], worst.get(key)
+                sign = _WORSE.get(attribute.direction)
+                if known is None or not sign or sign * (attribute.position(value) - attribute.position(known)) > 0:
+                    worst[key] = value
+        return worst
+
+    def forget_reports(self) -> None:
+        """Drop all reports, because they describe the previous profile."""
+        for client in self.known.values():
+            client.observed = {}
 
     def remove_absent(self, connected: Collection[str], now: float) -> list[str]:
         """Remove clients that have been unconnected for several calls; must be called periodically.
@@ -329,7 +377,7 @@ class Persistence(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, collect: Callable[[float, int], SavedState], path: Path) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
         self._collect = collect
         self._path = path
         self._lock: int | None = None
@@ -342,6 +390,7 @@ class Persistence(RuntimePart):
 
     async def restore(self) -> SavedState:
         """Read the file, restore the parameters and return the saved state; called before the parts start."""
+        self._runtime.undo.push_async_callback(self.close)
         resource, name = self._runtime.resource, self._runtime.node.name
         found, lost = SavedState(), list[str]()
         try:

@@ -19,17 +19,16 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.timers import Schedule
 from rmpa.resource import limits
-from rmpa.resource.declare import OnFailure
-from rmpa.resource.runtime import RuntimePart
-from rmpa.runtime.loop import MachineTimer, TimerFd
-from rmpa.runtime.tasks import keep_task
+from rmpa.resource.declare import DeclaredTopic, OnFailure, Parameter, Task
+from rmpa.resource.runtime import Runtime, RuntimePart
+from rmpa.runtime.accept import in_thread
+from rmpa.runtime.loop import TimerFd
+from rmpa.runtime.tasks import keep_task, start_task
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from rmpa.resource.declare import Input, Parameter, Task
     from rmpa.resource.quality import Value
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received
 
 _log = logging.getLogger(__name__)
@@ -62,13 +61,7 @@ class RunGate:
 
     def enter(self, run: object, ended: Callable[[], bool]) -> bool:
         """Wait in a thread until the gate is open; returns false if ``ended`` returns true while it is closed."""
-        # An open gate is entered without the lock: a closer examines the runs inside only after it has closed.
-        self._inside.add(run)
-        if not self._closers:
-            return True
         with self._change:
-            self._inside.discard(run)
-            self._change.notify_all()
             while self._closers:
                 if ended():
                     return False
@@ -87,10 +80,9 @@ class RunGate:
 
     def leave(self, run: object) -> None:
         """Remove a run that has ended, or a stuck one that closers shall not wait for."""
-        self._inside.discard(run)
-        if self._closers:
-            with self._change:
-                self._change.notify_all()
+        with self._change:
+            self._inside.discard(run)
+            self._change.notify_all()
 
     def close(self, closer: str) -> None:
         """Let no further run begin until ``closer`` opens the gate again."""
@@ -180,12 +172,28 @@ class TaskRunner:
         self._messages: deque[Received] = deque()
         if rate := task.rate_parameter.value if task.rate_parameter is not None else task.rate:
             self.period = 1 / rate
+        # The due times of a periodic task; ``None``: a new schedule begins.
+        self._schedule: Schedule | None = None
+
+    def start(self) -> None:
+        """Start the runs."""
+        self._running = self._begin()
 
     def stop(self, *, stuck: bool = False) -> None:
         """End the runs; ``stuck``: the present run hangs, so nothing waits for it."""
         self.stopped = True
         if stuck:
             self._tasks.gate.leave(self)
+            self._running.cancel()
+
+    async def ended(self) -> None:
+        """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
+        _, left = await asyncio.wait([self._running], timeout=limits.TASK_END_TIMEOUT)
+        if left:
+            _log.warning("! task %s does not end; the program goes on without it [ending-slowly]", self.task.name)
+
+    def _begin(self) -> asyncio.Task[None]:
+        raise NotImplementedError
 
     def retime(self, rate: float) -> None:
         """Change the rate, in Hz: the next run is due one new period after the last one."""
@@ -200,16 +208,22 @@ class TaskRunner:
         self._messages.append(message)
         self.wake()
 
-    def _next(self, schedule: Schedule, last: float) -> tuple[Schedule, float]:
-        """Advance to the next due time, in monotonic seconds.
+    def _next_due(self, last: float) -> float:
+        """The next due time, in monotonic seconds; ``last``: when the last run was due.
 
-        A changed period begins a new schedule: its first due time is one period after ``last``, the last one.
+        After a change of the period it is one period after the last one, after a failure one from now on.
         """
-        if self.period is not None and schedule.period != self.period:
-            schedule = Schedule(self.period, max(last + self.period, time.monotonic()))
-        due, missed = schedule.next_due(time.monotonic())
+        now, period = time.monotonic(), self.period or 0.0
+        if self._schedule is None or self._schedule.period != period:
+            self._schedule = Schedule(period, now if self._schedule is None else max(last + period, now))
+        due, missed = self._schedule.next_due(now)
         self.report.missed += missed
-        return schedule, due
+        return due
+
+    @property
+    def _is_retimed(self) -> bool:
+        """Whether the period has changed since the last due time was told."""
+        return self._schedule is not None and self._schedule.period != self.period
 
     def _call(self, message: Received | None) -> Awaitable[None] | None:
         self.running_since = time.monotonic()
@@ -224,6 +238,7 @@ class TaskRunner:
             self.lost, self.problem, self._in_a_row = 0, "", 0
             return 0.0
         self._in_a_row += 1
+        self._schedule = None
         before, self.problem = self.problem, f"task {self.task.name} failed: {type(error).__name__}: {error}"
         if self.problem != before:  # a repeated error is logged once
             _log.warning("! task %s failed [resource-trouble]", self.task.name, exc_info=error)
@@ -233,20 +248,15 @@ class TaskRunner:
 class AsyncTaskRunner(TaskRunner):
     """Runs a coroutine function in the event loop."""
 
-    def start(self) -> None:
-        """Start the runs in a task of the event loop."""
-        self._wake = asyncio.Event()
-        self.wake = self._wake.set
-        self._run_task = keep_task(self._run, f"task {self.task.name}")
-
     def stop(self, *, stuck: bool = False) -> None:
         """Cancel the present run, if any, and end; ``stuck``: the run is no longer counted as inside the gate."""
         super().stop(stuck=stuck)
-        self._run_task.cancel()
+        self._running.cancel()
 
-    async def ended(self) -> None:
-        """Wait until the last run has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
-        await asyncio.wait([self._run_task], timeout=limits.TASK_END_TIMEOUT)
+    def _begin(self) -> asyncio.Task[None]:
+        self._wake = asyncio.Event()
+        self.wake = self._wake.set
+        return keep_task(self._run, f"task {self.task.name}")
 
     async def _run(self) -> None:
         if self.lost:
@@ -260,26 +270,24 @@ class AsyncTaskRunner(TaskRunner):
             loop = asyncio.get_running_loop()
             loop.add_reader(timer.fileno(), self._wake.set)
             try:
-                await self._periodically(self.period, timer)
+                await self._periodically(timer)
             finally:
                 loop.remove_reader(timer.fileno())
 
-    async def _periodically(self, period: float, timer: TimerFd) -> None:
-        schedule, last = Schedule(period, time.monotonic()), -math.inf
+    async def _periodically(self, timer: TimerFd) -> None:
+        last = -math.inf
         while True:
-            schedule, due = self._next(schedule, last)
+            due = self._next_due(last)
             timer.set(due)
-            while not (over := timer.wait()) and schedule.period == self.period:
+            while not (over := timer.wait()) and not self._is_retimed:
                 self._wake.clear()
                 await self._wake.wait()
-            if not over:
-                continue  # the period has changed meanwhile
-            last = due
-            if not await self._once(None):
-                schedule = Schedule(schedule.period, time.monotonic())
+            if over:
+                last = due
+                await self._once(None)
 
-    async def _once(self, message: Received | None) -> bool:
-        """Run once; returns false after a failure and its back-off."""
+    async def _once(self, message: Received | None) -> None:
+        """Run once; after a failure the back-off follows."""
         await self._tasks.gate.enter_async(self)
         try:
             try:
@@ -295,77 +303,54 @@ class AsyncTaskRunner(TaskRunner):
             delay = await asyncio.to_thread(self._ended, error)  # the traceback reads source files
         else:
             self._ended(None)
-            return True
+            return
         self._tasks.failed(self, self.problem)
         await asyncio.sleep(delay)
-        return False
 
 
 class ThreadTaskRunner(TaskRunner):
     """Runs a plain function in a thread of its own."""
-
-    def start(self) -> None:
-        """Start the runs in a new thread."""
-        self._end = threading.Event()
-        self._ready = threading.Semaphore(0)
-        self.wake = self._ready.release
-        self._loop = asyncio.get_running_loop()
-        self._done = asyncio.Event()
-        # A daemon thread: a stuck one must not keep the process from exiting.
-        threading.Thread(target=self._run, name=f"task {self.task.name}", daemon=True).start()
 
     def stop(self, *, stuck: bool = False) -> None:
         """End after the present run; ``stuck``: the run hangs, so its thread is left behind."""
         super().stop(stuck=stuck)
         self._end.set()
         self._ready.release()
-        if stuck:
-            self._done.set()
 
-    async def ended(self) -> None:
-        """Wait until the thread has ended, at most ``limits.TASK_END_TIMEOUT`` seconds."""
-        try:
-            async with asyncio.timeout(limits.TASK_END_TIMEOUT):
-                await self._done.wait()
-        except TimeoutError:
-            _log.warning("! task %s does not end; the program goes on without it [ending-slowly]", self.task.name)
-
-    def _in_loop(self, function: Callable[..., object], *args: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the event loop has ended already
-            self._loop.call_soon_threadsafe(function, *args)
+    def _begin(self) -> asyncio.Task[None]:
+        self._end = threading.Event()
+        self._ready = threading.Semaphore(0)
+        self.wake = self._ready.release
+        name = f"task {self.task.name}"
+        return start_task(in_thread(self._run, name), name)
 
     def _run(self) -> None:
-        try:
-            if self.lost:
-                self._end.wait(restart_delay(self.lost))
-            if self.period is not None:
-                with TimerFd(blocking=True) as timer:
-                    self._periodically(self.period, timer)
-            while self._ready.acquire() and not self._end.is_set():
-                with contextlib.suppress(IndexError):  # woken without a message, or the message was dropped
-                    self._once(self._messages.popleft())
-        finally:
-            self._in_loop(self._done.set)
+        if self.lost:
+            self._end.wait(restart_delay(self.lost))
+        if self.period is not None:
+            with TimerFd(blocking=True) as timer:
+                self._periodically(timer)
+        while self._ready.acquire() and not self._end.is_set():
+            with contextlib.suppress(IndexError):  # woken without a message, or the message was dropped
+                self._once(self._messages.popleft())
 
-    def _periodically(self, period: float, timer: TimerFd) -> None:
-        schedule, last = Schedule(period, time.monotonic()), -math.inf
+    def _periodically(self, timer: TimerFd) -> None:
+        last = -math.inf
         while not self._end.is_set():
-            schedule, due = self._next(schedule, last)
-            while due - time.monotonic() > ENTER_SLICE and schedule.period == self.period:
+            due = self._next_due(last)
+            while due - time.monotonic() > ENTER_SLICE and not self._is_retimed:
                 if self._end.wait(min(due - time.monotonic() - ENTER_SLICE / 2, ENTER_SLICE)):
                     return
-            if schedule.period != self.period:
-                continue
-            last = due
-            timer.set(due)
-            timer.wait()
-            if not self._once(None):
-                schedule = Schedule(schedule.period, time.monotonic())
+            if not self._is_retimed:
+                last = due
+                timer.set(due)
+                timer.wait()
+                self._once(None)
 
-    def _once(self, message: Received | None) -> bool:
-        """Run once; returns false after a failure and its back-off, or if the task has to end."""
+    def _once(self, message: Received | None) -> None:
+        """Run once, unless the task has to end; after a failure the back-off follows."""
         if not self._tasks.gate.enter(self, self._end.is_set):
-            return False
+            return
         try:
             try:
                 self._call(message)
@@ -375,11 +360,10 @@ class ThreadTaskRunner(TaskRunner):
             delay = self._ended(error)
         else:
             self._ended(None)
-            return True
+            return
         if not self._end.is_set():
-            self._in_loop(self._tasks.failed, self, self.problem)
+            self._tasks.call_in_loop(self._tasks.failed, self, self.problem)
             self._end.wait(delay)
-        return False
 
 
 class Tasks(RuntimePart):
@@ -391,7 +375,8 @@ class Tasks(RuntimePart):
     """
 
     def __init__(self, runtime: Runtime, on_deactivate: Callable[[str], None]) -> None:
-        self._runtime = runtime
+        super().__init__(runtime)
+        self.call_in_loop = runtime.call_in_loop
         self._on_deactivate = on_deactivate
         self.gate = RunGate()
         self._runners: dict[str, AsyncTaskRunner | ThreadTaskRunner] = {}
@@ -399,8 +384,6 @@ class Tasks(RuntimePart):
         #
         # It is empty after the first such window, because that alone may be due to load of the machine.
         self._slow: dict[str, str] = {}
-        self._next_check: float | None = None
-        self._timer = MachineTimer(lambda: self._next_check, self._check_stuck, now=time.monotonic)
 
     def report(self, problem: str) -> str:
         """Log a new problem of a task, and return it."""
@@ -425,17 +408,20 @@ class Tasks(RuntimePart):
             elif before:
                 _log.info("= %s: task %s keeps up again", self._runtime.node.name, name)
 
+    async def start(self) -> None:
+        """Listen to the inputs on which tasks run."""
+        if any(task.on is not None for task in self._runtime.resource.tasks.values()):
+            self._runtime.listeners.append(self.heard)
+
     def activate(self) -> None:
         """Start all tasks."""
         for task in self._runtime.resource.tasks.values():
             self._start_task(task)
-        self._next_check = time.monotonic() + _STUCK_CHECK
-        self._timer.arm()
+        self._work.start(self._watch(), "look for stuck tasks")
 
     async def deactivate(self) -> None:
         """End all tasks; returns when none runs any more, except those that are stuck."""
-        self._next_check = None
-        self._timer.arm()
+        await self._work.close()
         runners, self._runners = list(self._runners.values()), {}
         self._slow.clear()
         for runner in runners:
@@ -443,7 +429,7 @@ class Tasks(RuntimePart):
         await asyncio.gather(*(runner.ended() for runner in runners))
 
     async def close(self) -> None:
-        """End all tasks, because the resource ends."""
+        """End all tasks."""
         await self.deactivate()
 
     async def pause(self, holder: str = "profile") -> None:
@@ -459,10 +445,10 @@ class Tasks(RuntimePart):
         """Let runs begin again, unless another change is under way."""
         self.gate.open(holder)
 
-    def received(self, item: Input, message: Received) -> None:
+    def heard(self, topic: DeclaredTopic, _raw: bytes, _now_ns: int, message: Received | None) -> None:
         """Queue a message for the tasks that run on its input."""
         for runner in self._runners.values():
-            if runner.task.on is item:
+            if runner.task.on is topic and message is not None:
                 runner.enqueue(message)
 
     def parameter_changed(self, parameter: Parameter) -> None:
@@ -490,16 +476,18 @@ class Tasks(RuntimePart):
         if runner.task.on_failure is OnFailure.DEACTIVATE:
             self._on_deactivate(f"task {runner.task.name}: {why}")
 
-    def _check_stuck(self, now: float) -> None:
-        self._next_check = now + _STUCK_CHECK
-        for runner in list(self._runners.values()):
-            task, since = runner.task, runner.running_since
-            if since is None or runner.stopped or now - since < stuck_after(runner.period, task.stuck_after):
-                continue
-            text = f"a run has not ended for {now - since:.3g} s"
-            problem = self.report(f"task {task.name} stuck: {text}")
-            runner.stop(stuck=True)
-            if task.on_failure is OnFailure.RESTART:
-                self._start_task(task, runner.lost + 1, problem)
-            else:
-                self._end(runner, text)
+    async def _watch(self) -> None:
+        """Give up runs that are stuck."""
+        while True:
+            await asyncio.sleep(_STUCK_CHECK)
+            for runner in list(self._runners.values()):
+                task, since, now = runner.task, runner.running_since, time.monotonic()
+                if since is None or runner.stopped or now - since < stuck_after(runner.period, task.stuck_after):
+                    continue
+                text = f"a run has not ended for {now - since:.3g} s"
+                problem = self.report(f"task {task.name} stuck: {text}")
+                runner.stop(stuck=True)
+                if task.on_failure is OnFailure.RESTART:
+                    self._start_task(task, runner.lost + 1, problem)
+                else:
+                    self._end(runner, text)

@@ -1,34 +1,44 @@
-"""The present values of what a resource's expressions refer to: topics, parameters, qualities, processes.
+"""The present values of what a resource's expressions refer to: topics, parameters, qualities, figures, diagnostics.
 
 One object serves all expressions of a resource: the rules of contexts, alarms and profiles, and the values of
 attributes. It subscribes to the topics that they name; those of the resource itself come by its own subscriptions.
+Figures of processes and of the machine are read once in each window, and only those that an expression uses. What is
+not known has no value.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import re
+import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.expression import split_reference
-from rmpa.resource.runtime import RuntimePart, topic_of
-from rmpa.runtime.tasks import OwnedTasks
+from rmpa.resource.expression import Scalar, SourceCall, split_reference
+from rmpa.resource.runtime import Runtime, RuntimePart, topic_of
+from rmpa.ros.types.definitions import ARRAY_TYPE
+from rmpa.ros.types.messages import MessageType
+from rmpa.runtime.accept import in_thread
+from rmpa.runtime.programs import CpuShares, figures
+from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Mapping
 
-    from rmpa.resource.declare import Input, Output, Parameter
-    from rmpa.resource.expression import Expression, Scalar, SourceCall
+    from rmpa.resource.declare import DeclaredTopic, Parameter
+    from rmpa.resource.processes import Processes
     from rmpa.resource.quality import Value
-    from rmpa.resource.runtime import Runtime
     from rmpa.ros.node.endpoints import Received, Subscriber
-    from rmpa.ros.types.messages import MessageType
 
 _log = logging.getLogger(__name__)
 # Seconds between the first two searches for topics that expressions refer to.
 _FIRST_LOOK: Final = 0.5
+_ZONES: Final = Path("/sys/class/thermal")
+_NUMBER: Final = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_FIGURES: Final = frozenset({"cpu", "memory", "temperature"})
 
 
 class ExpressionValues(RuntimePart):
@@ -36,43 +46,55 @@ class ExpressionValues(RuntimePart):
 
     Args:
         runtime: The runtime of the resource.
-        expressions: The expressions. More may not come later: the topics are looked up once.
+        processes: Knows the processes of nodes.
     """
 
-    def __init__(self, runtime: Runtime, expressions: Iterable[Expression]) -> None:
-        self._runtime = runtime
-        # What answers the functions of ``declaration.SOURCES``, by name: called with the arguments.
-        self.providers: dict[str, Callable[..., Scalar | None]] = {}
+    # More than 12 fields: what is referred to, and what is known of it.
+    def __init__(self, runtime: Runtime, processes: Processes) -> None:
+        super().__init__(runtime)
+        self._processes = processes
         # Called with the references whose values have changed.
-        self.listeners: list[Callable[[set[str]], None]] = []
-        references: set[str] = set()
+        self.on_change: Callable[[set[str]], None] = lambda _: None
+        expressions = [each for _, each in runtime.resource.expressions()]
+        references = {reference for each in expressions for reference in each.references}
         # The functions that the expressions call, by their text.
-        self.sources: dict[str, SourceCall] = {}
-        for each in expressions:
-            references.update(each.references)
-            self.sources.update(each.sources)
+        self._sources: dict[str, SourceCall] = {k: v for each in expressions for k, v in each.sources.items()}
         self._parameters = {reference for reference in references if reference.startswith("~")}
         self._fields = {text: TopicField(text) for text in references if text.startswith("/")}
-        self._attributes = references - self._parameters - self._fields.keys() - self.sources.keys()
+        self._attributes = references - self._parameters - self._fields.keys() - self._sources.keys()
         self._measured: Mapping[str, Value] = {}
         self._subscribers: dict[str, Subscriber] = {}
         # The topic of each input or output of the resource that a reference names, by the declared name.
         self._taps: dict[str, str] = {}
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
-        self._work = OwnedTasks()
+        # By node: shares of a core, and bytes; by type of thermal zone: °C.
+        self._cpu: dict[str, float] = {}
+        self._memory: dict[str, float] = {}
+        self._zones: Mapping[str, float] = {}
+        # By name of a status that an expression names: when it has come, its level, and its values.
+        self._diagnostics: dict[str, tuple[float, int, dict[str, str]]] = {}
 
     async def start(self) -> None:
-        """Look for the topics that the expressions name."""
+        """Look for the topics that the expressions name, and read what their functions answer."""
+        used = {source.function for source in self._sources.values()}
         if self._fields:
             self._work.start(self._find_topics(), "find topics of expressions")
-
-    async def close(self) -> None:
-        """Look no more."""
-        await self._work.close()
+        if used & _FIGURES:
+            self._work.add(keep_task(self._read_figures, f"figures for {self._runtime.resource.name}"))
+        if "diagnostics" in used:
+            await self._runtime.node.subscribe("/diagnostics", MessageType(ARRAY_TYPE), self._diagnosed)
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Why fields that expressions refer to cannot be read."""
         return [], [f"rule over {field.problem}" for field in self._fields.values() if field.problem]
+
+    def blocked(self) -> dict[str, str]:
+        """The profiles whose rule is false; an unknown rule blocks none."""
+        values, profiles = self.now(), self._runtime.resource.profiles.values()
+        rules = {one.name: one.rule for one in profiles if one.rule is not None}
+        return {
+            name: f"its rule does not hold: {rule}" for name, rule in rules.items() if rule.holds(values) is False
+        }
 
     def now(self) -> dict[str, Scalar]:
         """The known values, by reference."""
@@ -86,11 +108,8 @@ class ExpressionValues(RuntimePart):
                 self._latest.pop(field.topic, None)  # without a publisher the value is unknown
             if (latest := self._latest.get(field.topic)) and (value := field.read(*latest)) is not None:
                 found[text] = value
-        for text, source in self.sources.items():
-            provider = self.providers.get(source.function)
-            if provider is not None and (value := provider(*source.arguments)) is not None:
-                found[text] = value
-        return found
+        answers = {text: self._answer(source.function, *source.arguments) for text, source in self._sources.items()}
+        return found | {text: answer for text, answer in answers.items() if answer is not None}
 
     def derive(self, measured: Mapping[str, Value]) -> dict[str, Value]:
         """The values of a window, with those of attributes that have an expression and are known.
@@ -116,33 +135,19 @@ class ExpressionValues(RuntimePart):
     def window_ended(self, measured: Mapping[str, Value]) -> None:
         """Take the values of a window."""
         self._measured = measured
-        self._changed(self._attributes | self.sources.keys())
-
-    def received(self, item: Input, message: Received) -> None:
-        """Keep the message of an input if an expression refers to its topic."""
-        if item.name in self._taps:
-            self._update(self._taps[item.name], message.kind, message.raw)
-
-    def published(self, output: Output, raw: bytes, now_ns: int, caller: str = "") -> None:  # noqa: ARG002
-        """Keep the message of an output if an expression refers to its topic."""
-        if output.name in self._taps:
-            self._update(self._taps[output.name], output.type, raw)
+        self._changed(self._attributes | self._sources.keys())
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """Tell the listeners."""
+        """Tell of it."""
         self._changed({f"~{parameter.name}"} & self._parameters)
-
-    def _update(self, topic: str, kind: MessageType, raw: bytes) -> None:
-        self._latest[topic] = kind, raw
-        self._changed({text for text, field in self._fields.items() if field.topic == topic})
-
-    def _changed(self, references: set[str]) -> None:
-        for listener in self.listeners if references else ():
-            listener(references)
 
     def uses(self, name: str) -> bool:
         """Whether an expression has the messages of this input or output from the resource's own subscription."""
         return name in self._taps
+
+    def _changed(self, references: set[str]) -> None:
+        if references:
+            self.on_change(references)
 
     async def _find_topics(self) -> None:
         """Look up the topics that expressions refer to, and subscribe to them, until all are found."""
@@ -161,12 +166,63 @@ class ExpressionValues(RuntimePart):
     async def _subscribe(self, topic: str) -> None:
         resource, node = self._runtime.resource, self._runtime.node
         own = [name for name in (*resource.inputs, *resource.outputs) if topic_of(name, node.name) == topic]
-        heard = [name for name in own if self._runtime.hears(name)]
-        self._taps.update(dict.fromkeys(heard, topic))
-        if not heard and topic not in self._subscribers:  # else its messages come already
+        if heard := [name for name in own if self._runtime.hears(name)]:  # its messages come already
+            if not self._taps:
+                self._runtime.listeners.append(self._heard)
+            self._taps.update(dict.fromkeys(heard, topic))
+        elif topic not in self._subscribers:
             self._subscribers[topic] = await node.subscribe(
                 topic, callback=lambda message: self._update(topic, message.kind, message.raw)
             )
+
+    def _heard(self, topic: DeclaredTopic, raw: bytes, _now_ns: int, message: Received | None) -> None:
+        if topic.name in self._taps:
+            self._update(self._taps[topic.name], topic.type if message is None else message.kind, raw)
+
+    def _update(self, topic: str, kind: MessageType, raw: bytes) -> None:
+        self._latest[topic] = kind, raw
+        self._changed({text for text, field in self._fields.items() if field.topic == topic})
+
+    def _answer(self, function: str, first: str = "", key: str = "") -> Scalar | None:
+        """What a function of ``expression.SOURCES`` has for an answer; a node that is left out is the only one."""
+        node = first or next(iter(self._runtime.resource.nodes), "")
+        match function:
+            case "cpu":
+                return self._cpu.get(node)
+            case "memory":
+                return self._memory.get(node)
+            case "running":
+                return self._processes.pid(node) is not None
+            case "temperature":
+                return self._zones.get(first) if first else max(self._zones.values(), default=None)
+        at, level, values = self._diagnostics.get(first, (-limits.DIAGNOSTICS_LIFESPAN, 0, {}))
+        if time.monotonic() - at > limits.DIAGNOSTICS_LIFESPAN:
+            return None
+        if not key:
+            return level
+        if (text := values.get(key)) is None:
+            return None
+        number = _NUMBER.match(text)  # such as of "61.5 C"; a text without one is the answer itself
+        return float(number[1]) if number else text
+
+    async def _read_figures(self) -> None:
+        shares, zones = CpuShares(), any(one.function == "temperature" for one in self._sources.values())
+        while True:
+            pids = {key: pid for key in self._runtime.resource.nodes if (pid := self._processes.pid(key)) is not None}
+            found = {key: one for key, pid in pids.items() if (one := figures(pid)) is not None}
+            self._memory = {key: float(one.rss) for key, one in found.items()}
+            self._cpu = {key: shares.of(pids[key], one) for key, one in found.items()}
+            shares.keep(set(pids.values()))
+            if zones:
+                self._zones = await in_thread(read_zones, "thermal zones")
+            await asyncio.sleep(max(self._runtime.resource.settings.window, limits.FIGURES_PAUSE))
+
+    def _diagnosed(self, message: Received) -> None:
+        names = {one.arguments[0] for one in self._sources.values() if one.function == "diagnostics"}
+        for status in message.message.status:
+            if (name := str(status.name)) in names:
+                values = {str(pair.key): str(pair.value) for pair in status.values}
+                self._diagnostics[name] = time.monotonic(), int(status.level), values
 
 
 class TopicField:
@@ -210,3 +266,15 @@ class TopicField:
         if problem and self.problem != before:
             _log.warning("! the rule with %s [resource-trouble]", self.problem)
         return None if problem else value
+
+
+def read_zones(folder: Path = _ZONES) -> dict[str, float]:
+    """The temperature of each type of thermal zone in °C, of several of one type the hottest; may block."""
+    found: dict[str, float] = {}
+    for zone in folder.glob("thermal_zone*"):
+        try:
+            kind, value = (zone / "type").read_text().strip(), int((zone / "temp").read_text()) / 1000
+        except (OSError, ValueError):
+            continue  # a sensor that is switched off
+        found[kind] = max(value, found.get(kind, value))
+    return found
