@@ -307,8 +307,7 @@ def test_trust_check_says_what_is_enforced(seed: int, tmp_path: Path) -> None:
     gate = PermissionGate(Permissions(settings.trust))
     for _ in range(20):
         module, word, name = rng.choice(MODULES), rng.choice(WORDS), rng.choice(NAMES)
-        words = [module, word, name, "--config", str(file), "--json"]
-        answer = CliRunner().invoke(trust_check, words, standalone_mode=False)
+        answer = CliRunner().invoke(trust_check, [module, word, name, "--config", str(file), "--json"])
         if word == "action":
             asked = [(Access.PUBLISH, "goal cancel"), (Access.SUBSCRIBE, "status feedback result")]
         elif word == "action_serve":
@@ -318,7 +317,7 @@ def test_trust_check_says_what_is_enforced(seed: int, tmp_path: Path) -> None:
         each = [(access, f"{name}/{one}" if one else name) for access, ones in asked for one in ones.split(" ")]
         enforced = all(gate.admits(access, module, one) for access, one in each)
         assert json.loads(answer.output)["allowed"] is enforced, (module, word, name, file.read_text())
-        assert answer.return_value == (0 if enforced else 1)
+        assert answer.exit_code == (0 if enforced else 1)
 
 
 @pytest.mark.parametrize(

@@ -32,9 +32,9 @@ def test_each_example_is_read(text: str, tmp_path: Path) -> None:
 def test_what_is_said_of_the_first_example_is_so(words: str, answer: str, tmp_path: Path) -> None:
     file = tmp_path / "rmpa.toml"
     file.write_text(EXAMPLES[0])
-    result = CliRunner().invoke(trust_check, [*shlex.split(words), "--config", str(file)], standalone_mode=False)
+    result = CliRunner().invoke(trust_check, [*shlex.split(words), "--config", str(file)])
     assert result.output.strip() == answer
-    assert result.return_value == (0 if answer.startswith("yes") else 1)
+    assert result.exit_code == (0 if answer.startswith("yes") else 1)
 
 
 def test_every_key_and_every_counter_is_named() -> None:
