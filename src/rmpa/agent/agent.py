@@ -33,22 +33,22 @@ from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.identity import OWN_NODE, Guid, Identity, is_own
 from rmpa.core.statistics import Counters
 from rmpa.discovery.discovery import Discovery
-from rmpa.discovery.network import choose, further_addresses, list_interfaces, pick_address
-from rmpa.mesh.io.link import LinkHandlers
+from rmpa.discovery.network import Interface, choose, further_addresses, list_interfaces, pick_address
+from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.keepalive import rest_lease
 from rmpa.mesh.peering import REPLACED
 from rmpa.observe.control_client import ControlClient, find_agents, runtime_dir
-from rmpa.observe.control_server import ControlServer, control_group
+from rmpa.observe.control_server import ControlServer, Handler, control_group
 from rmpa.observe.graph import GraphRevisions
 from rmpa.observe.health import Diagnostics
 from rmpa.observe.operations import ControlOperations
 from rmpa.observe.sites import SiteRequests
-from rmpa.observe.snapshot import INFO
+from rmpa.observe.snapshot import INFO, AgentInfo
 from rmpa.observe.snapshot_builder import SnapshotBuilder
 from rmpa.observe.why.why import WhyService
 from rmpa.ros.core.embedded import RosCore
-from rmpa.ros.core.external import ExternalCore
+from rmpa.ros.core.external import Core, ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call_api, is_own_name
 from rmpa.ros.http.server import listen
@@ -68,11 +68,6 @@ if TYPE_CHECKING:
     from rmpa.config.read import Loaded
     from rmpa.config.settings import Settings
     from rmpa.discovery.membership import PeerEvent
-    from rmpa.discovery.network import Interface
-    from rmpa.mesh.io.link import PeerLink
-    from rmpa.observe.control_server import Handler
-    from rmpa.observe.snapshot import AgentInfo
-    from rmpa.ros.core.external import Core
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Self
 
 from rmpa import __version__
-from rmpa.config.settings import SETTINGS
+from rmpa.config.settings import SETTINGS, Settings
 from rmpa.core.errors import ConfigError, RmpaError, StartError
 from rmpa.core.timers import Backoff
 from rmpa.observe.control_client import ReloadReply, runtime_dir
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Sequence
 
     from rmpa.config.read import Loaded
-    from rmpa.config.settings import Settings
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ import msgspec
 
 from rmpa.bridge.messages import convert
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.module_name import state_dir
 from rmpa.core.errors import (
     ConfigError,
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.runtime.loop import SystemClock

@@ -16,7 +16,7 @@ from rmpa.bridge.rpc import PeerRpc
 from rmpa.bridge.sessions import Part, PeerSessions, call_each, guarded
 from rmpa.bridge.topics.part import Topics
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.identity import OWN_NODE
+from rmpa.core.identity import OWN_NODE, Identity
 from rmpa.core.statistics import Counters
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.node.slave_node import SlaveNode
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.config.settings import Settings
-    from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.external import Core
     from rmpa.ros.wire.xmlrpc import XmlRpcValue

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges, decode, encode
-from rmpa.bridge.peer_offers import ImportEffects
-from rmpa.bridge.sessions import Part, guarded
+from rmpa.bridge.peer_offers import ImportBook, ImportEffects, Remote
+from rmpa.bridge.sessions import Part, PeerSession, guarded
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.runtime.loop import MachineTimer, turn_end, until, yield_to_data
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.direct.paths import Paths
     from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.offers import OfferBook
-    from rmpa.bridge.peer_offers import ImportBook, Remote
     from rmpa.bridge.policy import BridgeContext, Place
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphState
 

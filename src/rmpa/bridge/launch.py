@@ -26,14 +26,14 @@ from rmpa.bridge.launched import (
 )
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.rpc import gate_for, meant, no_such_module
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import suggestion
 from rmpa.core.errors import RmpaError
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.kept_program import ProgramNote
-from rmpa.runtime.programs import RUNS, CpuShares
+from rmpa.runtime.programs import RUNS, CpuShares, ResourceRun, StartRule
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
 from rmpa.trust.permissions import PermissionDecision, asker_name, refusal
 
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.runtime.programs import ResourceRun, StartRule
 
 _log = logging.getLogger(__name__)
 

@@ -16,12 +16,12 @@ from rmpa.bridge.log_ring import LogQuery, LogRing, ModuleLog
 from rmpa.bridge.nodes import own_node, permitted_nodes
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.rpc import gate_for, meant, no_such_module
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.core.embedded import AGGREGATED, LOG, TOPIC
-from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.loggers import read_levels, set_level
 from rmpa.ros.node.slave_node import Subscription
 from rmpa.runtime.loop import yielding_to_data
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import PublisherConnection
 
 _log = logging.getLogger(__name__)

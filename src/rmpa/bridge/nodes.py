@@ -14,7 +14,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.rpc import gate_for
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
@@ -36,7 +36,7 @@ from rmpa.ros.environment import (
 from rmpa.ros.node.ask import end_node, node_connections, ping_node
 from rmpa.ros.node.listeners import local_addresses
 from rmpa.ros.node.loggers import GET
-from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosReply
 from rmpa.runtime.loop import yielding_to_data
@@ -47,10 +47,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.services.part import Services
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.master.parameters import GraphChange
-    from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
 
     _Table = Mapping[str, Collection[str]]

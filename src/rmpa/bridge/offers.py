@@ -14,16 +14,14 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Source, TopicOffer, is_crossing_name, is_crossing_type
-from rmpa.bridge.policy import Local, PolicyDecision, may_have
+from rmpa.bridge.messages import Message, Source, TopicOffer, is_crossing_name, is_crossing_type
+from rmpa.bridge.policy import BridgeContext, Local, PolicyDecision, may_have
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.trust.permissions import PermissionDecision
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Mapping
 
-    from rmpa.bridge.messages import Message
-    from rmpa.bridge.policy import BridgeContext
     from rmpa.config.peer_rules import Access
 
 

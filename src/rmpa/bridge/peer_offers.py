@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.offers import Effects, KeyT, OfferT, wire_of
+from rmpa.bridge.offers import Effects, KeyT, OfferT, PeerRun, wire_of
 from rmpa.core.facts import CROWDED, DENIED
 from rmpa.mesh import limits as mesh_limits
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, SubscriptionChanges
-    from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.policy import PolicyDecision
     from rmpa.config.peer_rules import Access
     from rmpa.trust.permissions import PermissionDecision

@@ -25,22 +25,19 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.config import limits as config_limits
-from rmpa.config.peer_rules import PolicySettings
+from rmpa.config.peer_rules import Access, PeerRule, PolicySettings, ServiceRule
 from rmpa.config.rules import CLOCK
-from rmpa.config.settings import Settings, TimeSettings
+from rmpa.config.settings import ServiceSettings, Settings, TimeSettings, TrustSettings
 from rmpa.config.values import PEER
 from rmpa.core.identity import NEVER_CROSSING, OUTSIDE_GUID, ROSOUT, is_own, matches, matches_any
 from rmpa.core.statistics import Counters
-from rmpa.trust.permissions import PermissionDecision, prohibition, refusal
+from rmpa.trust.permissions import PermissionDecision, Permissions, prohibition, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.messages import Origin, Source
-    from rmpa.config.peer_rules import Access, PeerRule, ServiceRule
-    from rmpa.config.settings import ServiceSettings, TrustSettings
     from rmpa.core.contract import Contracts, Transport
-    from rmpa.trust.permissions import Permissions
 
 
 _log = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Collection, Hashable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakValueDictionary
@@ -21,7 +21,6 @@ from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Awaitable, Collection, Hashable, Iterable, Iterator
 
     from rmpa.bridge.messages import Origin
     from rmpa.core.statistics import Counters

@@ -22,7 +22,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
 from rmpa.bridge.rpc import gate_for, meant
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import PeerRefused, RmpaError
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
 
 _log = logging.getLogger(__name__)
 # Requests to another module: keep what its ring has of a time; list what it has; read a part of a file; remove one.

@@ -16,16 +16,16 @@ import inspect
 import itertools
 import logging
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Notification, Request, Response, decode, encode, with_text, without_text
-from rmpa.bridge.policy import OPEN_GATE
+from rmpa.bridge.messages import Message, Notification, Request, Response, decode, encode, with_text, without_text
+from rmpa.bridge.policy import OPEN_GATE, Needs, PermissionGate
 from rmpa.bridge.services.bodies import BodyReceiver, BodySender, Budget
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.values import suggestion
 from rmpa.core.errors import (
     UNKNOWN_QUESTION,
@@ -41,12 +41,7 @@ from rmpa.core.limits import UINT32_MAX
 from rmpa.runtime.tasks import OwnedTasks, end_tasks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.messages import Message
-    from rmpa.bridge.policy import Needs, PermissionGate
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.core.statistics import Counters
 
 _log = logging.getLogger(__name__)

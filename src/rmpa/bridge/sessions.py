@@ -12,7 +12,7 @@ from rmpa.bridge.data.quality import PeerClockHistory
 from rmpa.bridge.data.reception import LinkTime
 from rmpa.bridge.offers import PeerRun, PeerState
 from rmpa.bridge.policy import OPEN_GATE, PermissionGate
-from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces
+from rmpa.bridge.proxies import PeerProxies, ProxyNamespaces, ProxyNodes
 from rmpa.core.log import logged_failure
 from rmpa.mesh import limits as mesh_limits
 from rmpa.runtime.loop import yield_to_data
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from rmpa.bridge.messages import Message, Origin
-    from rmpa.bridge.proxies import ProxyNodes
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.master.parameters import GraphChange
 

@@ -26,7 +26,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.offers import TopicBook
 from rmpa.bridge.peer_offers import ImportBook, Remote
-from rmpa.bridge.policy import Local, Needs
+from rmpa.bridge.policy import Local, Needs, Place
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config.peer_rules import Access
 from rmpa.core.facts import CROWDED
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.messages import Message, Origin
-    from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.node.slave_node import SlaveNode
 

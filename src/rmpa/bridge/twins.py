@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.core.identity import is_own, matches
 from rmpa.core.log import RefusalLog
 from rmpa.runtime.loop import SystemClock, yield_to_data
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.subscriptions import Subscriptions
     from rmpa.ros.master.parameters import GraphState
 

@@ -23,7 +23,7 @@ from rmpa.cli.options import Options, agent_verb, argument, config_option, flag,
 from rmpa.cli.output import Painted, Table, begin_log, paint_level, print_error, printable, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX, NameSource, choose_name, keep_name, state_dir
 from rmpa.config.read import load_settings
-from rmpa.config.settings import SETTINGS, json_value, schema_text, toml_value
+from rmpa.config.settings import SETTINGS, Settings, json_value, schema_text, toml_value
 from rmpa.core import codes
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe import limits
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.config.schema import Setting
-    from rmpa.config.settings import Settings
     from rmpa.observe.snapshot import Snapshot
 
 _log = logging.getLogger("rmpa.up")

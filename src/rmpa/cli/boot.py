@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.cli.options import Options, flag, json_verb, option
-from rmpa.cli.output import confirm
+from rmpa.cli.output import Text, confirm
 from rmpa.cli.units import (
     CONFIG,
     DROP_INS,
@@ -54,7 +54,6 @@ from rmpa.runtime.systemd import INSTALL, is_set_up
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from rmpa.cli.output import Text
 
 # The first line of each file that ``install`` makes: ``uninstall`` removes no other.
 _MARK: Final = "# Made by `rmpa service install`; changes belong into a drop-in: systemctl edit {unit}\n"

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.graph import find_peer, origin_text, run_stream
+from rmpa.cli.graph import Master, find_peer, origin_text, run_stream
 from rmpa.cli.options import Options, argument, flag, graph_verb, option, peers, summary
-from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, warn
+from rmpa.cli.output import Painted, Table, Text, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.observe import limits
@@ -24,8 +24,6 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.cli.graph import Master
-    from rmpa.cli.output import Text
     from rmpa.ros.node.node import Node
 
 _COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "magenta"}

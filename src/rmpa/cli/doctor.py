@@ -12,17 +12,13 @@ from typing import TYPE_CHECKING
 from rmpa.cli.options import FiniteRange, Options, config_option, flag, json_verb, option
 from rmpa.cli.output import Painted, confirm, paint_level, print_text, printable, warn
 from rmpa.observe import limits
-from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
+from rmpa.observe.check import FAIL, WARN, Check, CheckLevel, exit_code
 from rmpa.observe.doctor.checks import examine
-from rmpa.observe.doctor.machine import look_at
-from rmpa.observe.doctor.repairs import find_repairs
+from rmpa.observe.doctor.machine import DoctorInput, look_at
+from rmpa.observe.doctor.repairs import Repair, find_repairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-
-    from rmpa.observe.check import Check
-    from rmpa.observe.doctor.machine import DoctorInput
-    from rmpa.observe.doctor.repairs import Repair
 
 
 @json_verb(

@@ -17,8 +17,8 @@ from rmpa.cli.module import check_gateway, find_module
 from rmpa.cli.options import config_option, option, setting_options
 from rmpa.cli.output import begin_log, warn
 from rmpa.config.module_name import GATEWAY_SUFFIX
-from rmpa.config.read import load_settings
-from rmpa.config.settings import WebSettings
+from rmpa.config.read import Given, Loaded, load_settings
+from rmpa.config.settings import Settings, WebSettings
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.core.identity import peer_name_from
 from rmpa.observe.control_client import ControlClient, find_agents
@@ -28,8 +28,6 @@ from rmpa.trust.permissions import TrustStatus
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.config.read import Given, Loaded
-    from rmpa.config.settings import Settings
 
 _log = logging.getLogger("rmpa.gateway")
 # Settings whose options a gateway has not: its core is its own, and only for its proxies; it has an --insecure.

@@ -16,7 +16,7 @@ from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.identity import is_legal_name, is_meant, proxied_node, proxied_peer
 from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.limits import CONTROL_CALL_TIMEOUT
-from rmpa.ros.environment import DEFAULT_MASTER_URI
+from rmpa.ros.environment import DEFAULT_MASTER_URI, NodeFacts
 
 if TYPE_CHECKING:
     import asyncio
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from rmpa.core.facts import RouteInfo
     from rmpa.observe.snapshot import PeerInfo, Snapshot
-    from rmpa.ros.environment import NodeFacts
     from rmpa.ros.node.node import Node, Received
 
 # Seconds between two lines of figures, as rostopic has it.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import click
 import msgspec
 
-from rmpa.bridge.launched import ModuleResources
+from rmpa.bridge.launched import LaunchedResource, ModuleResources
 from rmpa.bridge.limits import LAUNCH_LOG_LINES
 from rmpa.cli.graph import suggestion
 from rmpa.cli.options import ANSWER, FiniteRange, Options, agent_verb, argument, flag, option, options_of, peers
@@ -22,7 +22,6 @@ from rmpa.ros.environment import NodeCost
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from rmpa.bridge.launched import LaunchedResource
     from rmpa.observe.control_client import ControlClient
 
 # Lines of each log that are shown, alone and before those that are followed.

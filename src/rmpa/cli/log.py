@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.bridge.limits import LOG_LINES_ASKED
-from rmpa.bridge.log_ring import LEVELS, ModuleLog
+from rmpa.bridge.log_ring import LEVELS, LogLine, ModuleLog
 from rmpa.cli.options import LINES, Options, agent_verb, argument, flag, nodes, option, peers
 from rmpa.cli.output import Painted, paint, print_json, print_text, printable, warn
 from rmpa.core.errors import ConfigError
@@ -22,7 +22,6 @@ from rmpa.core.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.log_ring import LogLine
     from rmpa.observe.control_client import ControlClient
     from rmpa.observe.snapshot import PeerInfo
 

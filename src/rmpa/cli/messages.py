@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import Enough, read_name, run_stream
+from rmpa.cli.graph import Enough, Graph, GraphName, read_name, run_stream
 from rmpa.cli.options import FiniteRange, Options, argument, count_option, flag, graph_verb, option, topics
 from rmpa.cli.output import fill_stamps, flatten, pick, print_json, print_text, read_values, shorten, to_text, warn
 from rmpa.core.errors import ConfigError, UnreachableError
 from rmpa.core.identity import proxied_node
 
 if TYPE_CHECKING:
-    from rmpa.cli.graph import Graph, GraphName
     from rmpa.ros.node.node import Node, Received
     from rmpa.ros.types.messages import MessageType
 

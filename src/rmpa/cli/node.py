@@ -7,7 +7,7 @@ import contextlib
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.cli.graph import CALLER_ID, Graph, GraphName, read_name
+from rmpa.cli.graph import CALLER_ID, Graph, GraphName, Master, read_name
 from rmpa.cli.options import (
     Options,
     Selection,
@@ -20,7 +20,7 @@ from rmpa.cli.options import (
     pings,
     selection_options,
 )
-from rmpa.cli.output import Table, paint, print_error, print_json, print_text, warn
+from rmpa.cli.output import Table, Text, paint, print_error, print_json, print_text, warn
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.core.identity import is_own, proxied_node, proxied_peer
 from rmpa.observe.limits import CONTROL_HANDLER_TIMEOUT
@@ -34,8 +34,6 @@ from rmpa.ros.node.loggers import LEVELS, read_levels, set_level
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.cli.graph import Master
-    from rmpa.cli.output import Text
 
 _T = TypeVar("_T")
 # A node and its peer; ``None``: this module's own.

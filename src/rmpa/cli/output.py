@@ -11,7 +11,7 @@ import re
 import sys
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TextIO, TypeAlias
 from unicodedata import combining, east_asian_width
 
 import click
@@ -22,7 +22,6 @@ from rmpa.core.errors import ConfigError, RmpaError, with_places
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from logging import Logger
-    from typing import TextIO
 
     from rmpa.config.settings import Settings
     from rmpa.ros.types.messages import Plain

@@ -18,9 +18,9 @@ import click
 import yaml
 
 from rmpa.bridge.params.owner import key_problem
-from rmpa.cli.graph import CALLER_ID, suggestion
+from rmpa.cli.graph import CALLER_ID, Master, suggestion
 from rmpa.cli.options import Options, agent_verb, argument, flag, graph_verb, option, options_of, peers
-from rmpa.cli.output import Painted, Table, json_text, size, warn
+from rmpa.cli.output import Painted, Table, Text, json_text, size, warn
 from rmpa.config.rules import ROS2
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.facts import FollowedInfo
@@ -32,8 +32,6 @@ from rmpa.ros import limits as ros_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.cli.graph import Master
-    from rmpa.cli.output import Text
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 # Seconds for one call of a master: it may bring megabytes of XML, from a busy machine.

@@ -22,22 +22,18 @@ from rmpa.cli.options import (
     pings,
     summary,
 )
-from rmpa.cli.output import Table, duration, printable, size, warn
+from rmpa.cli.output import Table, Text, duration, printable, size, warn
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
 from rmpa.core.statistics import SampleSpread
 from rmpa.observe import limits
-from rmpa.observe.control_client import GATEWAY_REPORT
-from rmpa.observe.sites import REPORT, SITE_INFO, SitesReport
-from rmpa.observe.snapshot import PENDING, ModuleFacts, PingReply
+from rmpa.observe.control_client import GATEWAY_REPORT, ControlClient
+from rmpa.observe.sites import REPORT, SITE_INFO, SiteInfo, SitesReport
+from rmpa.observe.snapshot import PENDING, ModuleFacts, PeerInfo, PingReply, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.cli.output import Text
     from rmpa.core.facts import RouteInfo, TopicInfo
-    from rmpa.observe.control_client import ControlClient
-    from rmpa.observe.sites import SiteInfo
-    from rmpa.observe.snapshot import PeerInfo, Snapshot
 
 _T = TypeVar("_T")
 # By the state of a peer or site.

@@ -12,7 +12,7 @@ import msgspec
 
 from rmpa.cli.graph import suggestion
 from rmpa.cli.options import Options, argument, completes, flag, graph_verb, options_of
-from rmpa.cli.output import Table, printable, warn
+from rmpa.cli.output import Table, Text, printable, warn
 from rmpa.cli.resource import resource_names, resource_verb, run_with_resources, status_of
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.quality import MEASURED
@@ -21,7 +21,6 @@ from rmpa.ros.types.definitions import ARRAY_TYPE
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from rmpa.cli.output import Text
     from rmpa.cli.resource import ResourceGraph, SeenResource
     from rmpa.ros.types.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from rmpa.cli.main import LazyGroup
-from rmpa.cli.module import check_record, find_module
+from rmpa.cli.module import Module, check_record, find_module
 from rmpa.cli.options import (
     FiniteRange,
     Options,
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.bridge.recordings import ModuleRecordings
-    from rmpa.cli.module import Module
 
     _ByModule = dict[str, ModuleRecordings]
 

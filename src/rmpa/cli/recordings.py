@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
-from rmpa.bridge.kept import recording_id
+from rmpa.bridge.kept import Kept, recording_id
 from rmpa.bridge.limits import RECORDING_PART
 from rmpa.bridge.recordings import FilePart, ModuleRecordings
 from rmpa.cli.module import check_record
@@ -26,7 +26,6 @@ from rmpa.observe.operations import remove_recording
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from rmpa.bridge.kept import Kept
     from rmpa.observe.control_client import ControlClient
     from rmpa.record.merge import Timeline
 

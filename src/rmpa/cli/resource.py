@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
-from rmpa.bridge.launched import ModuleResources
-from rmpa.cli.graph import GraphName, read_name, run_stream, suggestion
+from rmpa.bridge.launched import LaunchedResource, ModuleResources
+from rmpa.cli.graph import Graph, GraphName, Master, read_name, run_stream, suggestion
 from rmpa.cli.options import Options, argument, count_option, flag, graph_of, graph_verb, of_peer
 from rmpa.cli.output import Painted, Table, paint, print_json, print_text, printable, size, warn
 from rmpa.config.rules import ROS2
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     import click
 
-    from rmpa.bridge.launched import LaunchedResource
-    from rmpa.cli.graph import Graph, Master
     from rmpa.ros.node.endpoints import Received
     from rmpa.ros.node.node import Node
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.graph import CALLER_ID, marked, origin_json, origin_text, peers_of, read_name
+from rmpa.cli.graph import CALLER_ID, Graph, GraphName, Master, marked, origin_json, origin_text, peers_of, read_name
 from rmpa.cli.options import (
     FiniteRange,
     Options,
@@ -22,7 +22,7 @@ from rmpa.cli.options import (
     selection_options,
     services,
 )
-from rmpa.cli.output import Table, duration, fill_stamps, print_json, printable, read_values, to_text, warn
+from rmpa.cli.output import Table, Text, duration, fill_stamps, print_json, printable, read_values, to_text, warn
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import call_api
@@ -32,8 +32,6 @@ from rmpa.ros.types.find import find_service_type
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from rmpa.cli.graph import Graph, GraphName, Master
-    from rmpa.cli.output import Text
     from rmpa.core.facts import ServiceInfo
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription

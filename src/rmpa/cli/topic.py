@@ -35,7 +35,7 @@ from rmpa.cli.options import (
     selection_options,
     topics,
 )
-from rmpa.cli.output import Painted, duration, print_json, print_text, printable, size, warn
+from rmpa.cli.output import Painted, Text, duration, print_json, print_text, printable, size, warn
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import proxied_peer
 from rmpa.core.statistics import SampleSpread
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from rmpa.cli.graph import Graph, GraphName, Master
-    from rmpa.cli.output import Text
     from rmpa.core.facts import RouteInfo, SubscriberTransport, TopicInfo
     from rmpa.ros.node.node import Received
 

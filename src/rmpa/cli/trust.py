@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
-from rmpa.cli.module import agent_settings, check_library, find_module, keep_member_name, module_verb
+from rmpa.cli.module import Module, agent_settings, check_library, find_module, keep_member_name, module_verb
 from rmpa.cli.options import Options, argument, config_option, flag, json_verb, option, peers
-from rmpa.cli.output import Table, confirm, duration, print_json, warn
+from rmpa.cli.output import Table, Text, confirm, duration, print_json, warn
 from rmpa.config.peer_rules import ACTION_CLIENT, ACTION_SERVER, Access
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError
 from rmpa.core.identity import is_global_name, peer_name_problem
@@ -33,14 +33,11 @@ from rmpa.trust.permissions import (
     TrustStatus,
     action_topics,
 )
-from rmpa.trust.store import keys_elsewhere, modules_with_keys
+from rmpa.trust.store import MemberFiles, keys_elsewhere, modules_with_keys
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.cli.module import Module
-    from rmpa.cli.output import Text
-    from rmpa.trust.store import MemberFiles
 
 _LIFETIME: Final = re.compile(r"([0-9]{1,6})\s*(s|min|h|d)")
 _UNITS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400}

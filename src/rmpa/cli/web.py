@@ -15,18 +15,16 @@ from urllib.parse import urlsplit
 
 import click
 
-from rmpa.cli.module import agent_settings, check_web, find_module
+from rmpa.cli.module import Module, agent_settings, check_web, find_module
 from rmpa.cli.options import Options, agent_verb, config_option, flag, option
 from rmpa.cli.output import Painted, begin_log
 from rmpa.config.read import INSECURE
-from rmpa.config.settings import WebSettings
+from rmpa.config.settings import Settings, WebSettings
 from rmpa.config.values import HOST, BadValue
 from rmpa.core.errors import ConfigError
 from rmpa.trust.permissions import Permissions
 
 if TYPE_CHECKING:
-    from rmpa.cli.module import Module
-    from rmpa.config.settings import Settings
     from rmpa.web.server.process import TokenAccess, WebSetup
 
 _log = logging.getLogger("rmpa.web")

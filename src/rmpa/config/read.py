@@ -13,7 +13,7 @@ from rmpa.config.peer_rules import peer_warnings, permission_problems
 from rmpa.config.rules import contract_warnings
 from rmpa.config.settings import SETTINGS, Settings, json_schema
 from rmpa.config.toml_file import check_writers, dotted, line_of, read_toml, value_at
-from rmpa.config.values import BadValue, did_you_mean, suggestion
+from rmpa.config.values import BadValue, Place, did_you_mean, suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.config.schema import Key, Setting
-    from rmpa.config.values import Place
 
 
 # Where settings come from, each source stronger than the one before it::

@@ -46,13 +46,12 @@ from rmpa.config.values import (
     whole_number,
     word_of,
 )
-from rmpa.core.contract import DEFAULT_TRANSPORT, Contracts, Transport
+from rmpa.core.contract import DEFAULT_TRANSPORT, ContractRule, Contracts, Transport
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rmpa.config.values import JsonSchema
-    from rmpa.core.contract import ContractRule
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,14 +30,13 @@ from rmpa.core.log import RefusalLog
 from rmpa.core.timers import AddressLimit, TokenBucket
 from rmpa.discovery import limits
 from rmpa.trust import limits as trust_limits
-from rmpa.trust.packets import Verdict
+from rmpa.trust.packets import PacketTrust, Verdict, Verification
 from rmpa.trust.permissions import TrustReason, not_of_this_mesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.statistics import Counters
-    from rmpa.trust.packets import PacketTrust, Verification
 
 _log = logging.getLogger(__name__)
 

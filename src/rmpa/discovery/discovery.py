@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.discovery import limits, network
-from rmpa.discovery.beacon import PacketFilter, Stranger
-from rmpa.discovery.membership import MembershipProtocol
+from rmpa.discovery.beacon import Address, Beacon, PacketFilter, Stranger
+from rmpa.discovery.membership import MembershipProtocol, PeerEvent
 from rmpa.runtime.loop import MachineTimer, call_at_tick, yield_to_data
 from rmpa.runtime.tasks import end_tasks, keep_task
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Guid, Identity
-    from rmpa.discovery.beacon import Address, Beacon
-    from rmpa.discovery.membership import PeerEvent
     from rmpa.discovery.network import Interface
     from rmpa.trust.packets import PacketTrust
 

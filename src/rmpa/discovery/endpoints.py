@@ -13,18 +13,15 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from rmpa.core import limits as core_limits
-from rmpa.core.identity import is_later, serial_add
-from rmpa.core.timers import AddressLimit, Backoff, TimerQueue, TokenBucket, earliest
+from rmpa.core.identity import Guid, Identity, is_later, serial_add
+from rmpa.core.timers import AddressLimit, Backoff, TimerQueue, TokenBucket, Yielder, earliest
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.beacon import Address, Beacon, BeaconKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from rmpa.core.identity import Guid, Identity
     from rmpa.core.statistics import Counters
-    from rmpa.core.timers import Yielder
-    from rmpa.discovery.beacon import Address
 
 # Seconds after a goodbye in which beacons that were sent before it may still come, or be read from another socket. A
 # beacon that comes later refutes the goodbye.

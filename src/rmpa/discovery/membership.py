@@ -17,7 +17,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.statistics import Counters
 from rmpa.core.timers import earliest
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import BeaconKind
+from rmpa.discovery.beacon import Address, Beacon, BeaconKind
 from rmpa.discovery.endpoints import (
     LINKED,
     NEVER,
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ipaddress import IPv4Address
 
     from rmpa.core.identity import Guid, Identity
-    from rmpa.discovery.beacon import Address, Beacon
     from rmpa.discovery.endpoints import OutgoingBeacon
 
 # When a starting agent announces itself, in seconds after its start: Wi-Fi loses multicast, so one beacon is not

@@ -21,14 +21,13 @@ import psutil
 from rmpa.core.limits import KIB
 from rmpa.core.timers import Backoff
 from rmpa.discovery import limits
-from rmpa.discovery.beacon import KIND_AT, BeaconKind
+from rmpa.discovery.beacon import KIND_AT, Address, BeaconKind
 from rmpa.runtime.accept import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.core.statistics import Counters
-    from rmpa.discovery.beacon import Address
 
 _log = logging.getLogger(__name__)
 

@@ -15,21 +15,18 @@ from rmpa.bridge.proxies import PeerProxies
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.identity import OUTSIDE_GUID, peer_name_problem
-from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.rules import ForeignSource, SourceKey, SourceKind
 from rmpa.ros.node.publication import Publication, PublicationEvents
-from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.wire.tcpros import LENGTH, TopicDescription, printable
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.wire.tcpros import LENGTH, Buffer, ServiceDescription, TopicDescription, printable
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.agent.agent import Agent
-    from rmpa.gateway.rules import SourceKey
     from rmpa.gateway.zenoh.session import ArrivedQuery
-    from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 
     Respond = Callable[[ArrivedQuery], Awaitable[tuple[bytes, bytes]]]
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.agent.agent import Agent
 from rmpa.agent.process import run_process, serve
-from rmpa.config.settings import ResourceSettings
+from rmpa.config.settings import ResourceSettings, Settings
 from rmpa.core.errors import RmpaError, StartError
 from rmpa.core.timers import Backoff
 from rmpa.gateway import limits
 from rmpa.gateway.own_graph import AgentGraph
-from rmpa.gateway.zenoh.session import open_trusted_session
+from rmpa.gateway.zenoh.session import OpenSession, open_trusted_session
 from rmpa.observe.control_client import GATEWAY_REPORT, GATEWAY_ROLE, ROLE
 from rmpa.runtime.plugins import NEIGHBOURS, load_plugins, plugin_error
 from rmpa.runtime.tasks import keep_task, start_task
@@ -25,11 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
 
     from rmpa.config.read import Loaded
-    from rmpa.config.settings import Settings
     from rmpa.gateway.ros2.graph import Ros2Link
     from rmpa.gateway.ros2.rclpy_session import RclpySession
     from rmpa.gateway.rules import Neighbour
-    from rmpa.gateway.zenoh.session import OpenSession
 
 _log = logging.getLogger(__name__)
 

@@ -23,11 +23,11 @@ from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.core.log import logged_failure
 from rmpa.gateway.foreign import ForeignSite, ProxiedService, ProxiedTopic
-from rmpa.gateway.rules import MeshSource, SourceKind
-from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKey, SourceKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
-from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
-from rmpa.ros.wire.tcpros import LENGTH, TopicDescription
+from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection, TopicConnection
+from rmpa.ros.wire.tcpros import LENGTH, Buffer, Header, ServiceDescription, TopicDescription
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.config.settings import Settings
-    from rmpa.gateway.rules import ForeignSource, SourceKey
-    from rmpa.ros.master.parameters import GraphChange
-    from rmpa.ros.node.subscription import TopicConnection
-    from rmpa.ros.wire.tcpros import Buffer, Header, ServiceDescription
 
 _log = logging.getLogger(__name__)
 # The node that subscribes to what neighbours want.

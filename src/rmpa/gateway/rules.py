@@ -11,17 +11,14 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.bridge.policy import OPEN_GATE
+from rmpa.bridge.policy import OPEN_GATE, BridgeContext, PermissionGate
 from rmpa.config.peer_rules import Access
-from rmpa.config.rules import ROS2, Crossing
+from rmpa.config.rules import ROS2, Crossing, CrossingRule
 from rmpa.core.identity import is_global_name, matches_any
 from rmpa.trust.permissions import asker_name, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-
-    from rmpa.bridge.policy import BridgeContext, PermissionGate
-    from rmpa.config.rules import CrossingRule
 
 
 class SourceKind(StrEnum):

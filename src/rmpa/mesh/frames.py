@@ -9,18 +9,15 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import rmpa
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.identity import SERIAL_MASK, Guid, Identity, peer_name_problem
-from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
 from rmpa.mesh import limits
 from rmpa.trust.permissions import TrustReason
-
-if TYPE_CHECKING:
-    from rmpa.core.outbox import QueuedMessage
 
 Buffer = bytes | bytearray | memoryview
 

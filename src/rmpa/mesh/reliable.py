@@ -21,15 +21,12 @@ speed.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from rmpa.core.identity import SERIAL_HALF, SERIAL_MASK, is_earlier, is_later, serial_add, serial_distance
 from rmpa.mesh import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 # The longest delay of an acknowledgement after the first message that it covers. The sender of few messages keeps
 # them in memory for this much longer.

@@ -42,14 +42,13 @@ from rmpa.core.errors import (
 )
 from rmpa.core.limits import KIB
 from rmpa.observe import limits
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.snapshot import AgentInfo, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from types import TracebackType
 
     from rmpa.core.timers import Yielder
-    from rmpa.observe.snapshot import AgentInfo
 
 
 class ReloadReply(msgspec.Struct, kw_only=True, frozen=True):

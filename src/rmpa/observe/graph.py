@@ -17,13 +17,12 @@ import msgspec
 
 from rmpa.core.errors import ConfigError
 from rmpa.observe import limits
-from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.ros.core.external import Core
-    from rmpa.ros.master.parameters import GraphChange, GraphState
 
 _Nodes = tuple[str, ...]
 

@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
-from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
+from rmpa.observe.check import FAIL, OK, STALE, WARN, Check, CheckLevel
 from rmpa.observe.why.diagnosis import BY_RULE, connected_directly, misplaced, subscriber_text
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.types.definitions import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array, known_description
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.facts import BridgeFacts
     from rmpa.core.facts import RouteInfo, ServiceInfo, TopicInfo
     from rmpa.core.statistics import SampleSpread
-    from rmpa.observe.check import CheckLevel
     from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
 

@@ -19,18 +19,18 @@ from rmpa.bridge.kept import Kept
 from rmpa.bridge.log import LEVEL
 from rmpa.bridge.params import owner as param_requests
 from rmpa.bridge.recordings import ModuleRecordings
-from rmpa.bridge.topics.rates import RATES
+from rmpa.bridge.topics.rates import RATES, Rates
 from rmpa.config.rules import ROS2
 from rmpa.config.values import suggestion
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.facts import ContractTerm, FollowedInfo
 from rmpa.core.identity import OWN_NODE, is_global_name, is_meant
 from rmpa.observe import limits
-from rmpa.observe.sites import PARAM
+from rmpa.observe.sites import PARAM, SiteRequests
 from rmpa.observe.snapshot import INFO, PingReply, Snapshot
 from rmpa.ros.environment import NodeLine, PeerNodes
 from rmpa.ros.master.parameters import leaves
-from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, parse_response, serialize_response
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -39,12 +39,9 @@ if TYPE_CHECKING:
     from rmpa.bridge.nodes import Nodes
     from rmpa.bridge.params.follower import Params
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.bridge.topics.rates import Rates
     from rmpa.observe.control_client import ControlClient
     from rmpa.observe.control_server import Handler
-    from rmpa.observe.sites import SiteRequests
     from rmpa.observe.snapshot_builder import SnapshotBuilder
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 Args = dict[str, Any]
 

@@ -20,7 +20,7 @@ from rmpa.discovery import limits as discovery_limits
 from rmpa.observe.snapshot import FOREIGN, PENDING, REVOKED, AgentInfo, PeerInfo, Snapshot, read_facts
 from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
-from rmpa.trust.permissions import TrustReason, not_of_this_mesh
+from rmpa.trust.permissions import TrustReason, TrustStatus, not_of_this_mesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import Peer
     from rmpa.ros.core.external import Core
-    from rmpa.trust.permissions import TrustStatus
 
 # Seconds after the end of a peer's link in which its beacon may still be one from before.
 ADDRESS_SHARED_MARGIN: Final = 1.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import math
 import shlex
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final
@@ -23,8 +23,6 @@ from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from rmpa.resource.expression import Expression
     from rmpa.resource.quality import Attribute, QoSRequest, RequirementAnswer, Value
     from rmpa.ros.types.messages import MessageType

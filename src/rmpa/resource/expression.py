@@ -25,16 +25,13 @@ from __future__ import annotations
 import operator
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rmpa.config.values import did_you_mean, suggestion
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
 
 # A value that rules can compare.
 Scalar = bool | int | float | str

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from rmpa.config.values import suggestion
@@ -35,7 +35,6 @@ from rmpa.resource.quality import MEASURED, Attribute, Category, Direction, Scal
 from rmpa.runtime.programs import StartRule
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from rmpa.resource.declare import Binding, Hook, ManagedNode, ParameterValue

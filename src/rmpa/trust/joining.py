@@ -17,7 +17,7 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError, StartError, Unrea
 from rmpa.core.log import RefusalLog
 from rmpa.trust import certificates, limits, tokens
 from rmpa.trust.certificates import DenyList, KeyList, read_certificate, read_document
-from rmpa.trust.membership import new_key, private_key
+from rmpa.trust.membership import Membership, MeshAuthority, new_key, private_key
 from rmpa.trust.permissions import JoinStep, MemberInfo, TokenInfo, TrustError, TrustReason, TrustStatus
 from rmpa.trust.store import ALPN_JOIN, CERTIFICATE, KEY, MemberFiles, join_context, member_context
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from rmpa.core.statistics import Counters
     from rmpa.runtime.loop import SystemClock
     from rmpa.runtime.tls import TlsHandshake
-    from rmpa.trust.membership import Membership, MeshAuthority
     from rmpa.trust.tokens import Token
 
 _log = logging.getLogger(__name__)

@@ -12,17 +12,14 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from enum import StrEnum
 from operator import sub
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from rmpa.bridge import limits
-from rmpa.core.contract import Liveliness
+from rmpa.core.contract import Contract, Liveliness
 from rmpa.core.facts import LatencyInfo
 from rmpa.core.statistics import SampleSpread
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.wire.tcpros import LENGTH
-
-if TYPE_CHECKING:
-    from rmpa.core.contract import Contract
 
 
 class PeerClockHistory:

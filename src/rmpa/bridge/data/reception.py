@@ -13,7 +13,7 @@ import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.data.quality import QosWatch, Quality
+from rmpa.bridge.data.quality import QosEvent, QosWatch, Quality
 from rmpa.bridge.data.route import kept_for
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -30,7 +30,6 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.data.quality import QosEvent
     from rmpa.core.statistics import Counters
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.publication import Publication

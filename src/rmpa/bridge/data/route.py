@@ -18,12 +18,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.core.contract import History, Priority
+from rmpa.core.contract import Contract, History, Priority
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Lane
 
 if TYPE_CHECKING:
-    from rmpa.core.contract import Contract
     from rmpa.mesh.reliable import Outgoing
 
 EXPRESS: Final = Lane.EXPRESS

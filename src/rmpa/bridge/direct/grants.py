@@ -40,7 +40,7 @@ from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.wire.slave_api import TCPROS
 from rmpa.ros.wire.tcpros import parse_service_uri
 from rmpa.ros.wire.xmlrpc import RosFault
-from rmpa.runtime.kernel_tcp import connections, end_connections, listening_addresses
+from rmpa.runtime.kernel_tcp import TcpSocket, connections, end_connections, listening_addresses
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.services.books import ServiceExports
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import Exports
-    from rmpa.runtime.kernel_tcp import TcpSocket
 
 _log = logging.getLogger(__name__)
 _EVERY_ADDRESS: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104 - recognised, not bound

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, NamedTuple
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.bridge.messages import Name, NameOrNone, convert, is_crossing_name
+from rmpa.bridge.messages import Name, NameOrNone, Origin, convert, is_crossing_name
 from rmpa.bridge.peer_offers import EntryT
 from rmpa.core.contract import Contract, Transport, needs_agents
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.messages import Origin
     from rmpa.bridge.sessions import PeerSession
 
 

@@ -14,16 +14,14 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits
 from rmpa.bridge.params.owner import FOLLOW, VALUE, ParamCore, ParamOwner, follow_rules, read_text, text_of
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.sessions import Part
-from rmpa.config.rules import SIM_TIME, overlap
+from rmpa.bridge.sessions import Part, PeerSession
+from rmpa.config.rules import SIM_TIME, FollowRule, overlap
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.core.log import RefusalLog
 from rmpa.runtime.tasks import end_tasks, start_task
 
 if TYPE_CHECKING:
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.config.rules import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)

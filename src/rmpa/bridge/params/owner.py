@@ -21,7 +21,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.policy import Needs
+from rmpa.bridge.policy import Needs, PermissionGate
 from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import SIM_TIME, FollowRule, overlap, untouchable
@@ -30,7 +30,7 @@ from rmpa.core.identity import OWN_NODE, matches_any
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import read_large, slices
 from rmpa.ros.master.parameters import holds_nil, leaves
-from rmpa.ros.wire.xmlrpc import response_pieces
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, response_pieces
 from rmpa.runtime.loop import yield_to_data, yielding_to_data
 from rmpa.runtime.tasks import start_task
 from rmpa.trust.permissions import refusal
@@ -39,12 +39,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.policy import PermissionGate
     from rmpa.bridge.sessions import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
 

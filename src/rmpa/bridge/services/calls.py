@@ -22,7 +22,7 @@ from rmpa.core.identity import SERIAL_MASK, is_type_name
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.http.rpc import is_own_name
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.wire.tcpros import parse_service_uri
+from rmpa.ros.wire.tcpros import ServiceDescription, parse_service_uri
 from rmpa.runtime.kernel_tcp import ask_listening_ports
 from rmpa.runtime.loop import sleep_to_tick, yielding_to_data
 from rmpa.runtime.tasks import OwnedTasks, end_tasks, keep_task
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.tcpros import ServiceDescription
     from rmpa.runtime.tls import Buffer
 
 _OK: Final = b"\x01"

@@ -15,31 +15,27 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.bridge import limits
 from rmpa.bridge.direct.grants import ServiceGrants
 from rmpa.bridge.graph_part import GraphPart
-from rmpa.bridge.messages import CloseService, OpenService, ServiceClosed, ServiceOpened, Source
+from rmpa.bridge.messages import CloseService, Message, OpenService, ServiceClosed, ServiceOpened, Source
 from rmpa.bridge.offers import PeerState
-from rmpa.bridge.policy import Needs, service_place
+from rmpa.bridge.policy import Needs, Place, service_place
 from rmpa.bridge.services.bodies import LocalService
-from rmpa.bridge.services.books import ServiceExports, ServiceImports
+from rmpa.bridge.services.books import RemoteService, ServiceExports, ServiceImports
 from rmpa.bridge.services.calls import Budgets, Server, Serving, ShownService
 from rmpa.bridge.services.direct import ServicePaths
 from rmpa.core.facts import DENIED
 from rmpa.core.identity import is_own
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.wire.tcpros import printable
+from rmpa.ros.wire.tcpros import ServiceDescription, printable
 from rmpa.runtime.loop import yielding_to_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.messages import Message
     from rmpa.bridge.peer_offers import Remote
-    from rmpa.bridge.policy import Place
-    from rmpa.bridge.services.books import RemoteService
     from rmpa.bridge.sessions import PeerSession
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.tcpros import ServiceDescription
 
 _log = logging.getLogger(__name__)
 

@@ -36,7 +36,7 @@ from rmpa.ros.http.rpc import call, call_api, is_own_name
 from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.ask import probe
 from rmpa.ros.node.listeners import local_addresses
-from rmpa.ros.wire.slave_api import TCPROS, read_bus_info
+from rmpa.ros.wire.slave_api import TCPROS, BusConnection, read_bus_info
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 from rmpa.runtime.kernel_tcp import connections
 from rmpa.runtime.loop import yielding_to_data
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.import_route import RemoteTopic
     from rmpa.bridge.topics.imports import Imports
-    from rmpa.ros.wire.slave_api import BusConnection
 
     TopicPath = Path[RemoteTopic]
 

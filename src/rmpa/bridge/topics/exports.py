@@ -26,7 +26,7 @@ from msgspec import UNSET
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.export import ExportFlow, ExportRoute, RelayedFlow
-from rmpa.bridge.data.route_sender import ReliableRouteSender
+from rmpa.bridge.data.route_sender import ReliableRouteSender, RouteSender
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,
@@ -38,7 +38,7 @@ from rmpa.bridge.messages import (
     TopicOffer,
 )
 from rmpa.bridge.offers import TopicBook
-from rmpa.bridge.policy import Local
+from rmpa.bridge.policy import Local, Relay
 from rmpa.bridge.topics.import_route import ImportRoute
 from rmpa.bridge.topics.joins import ServedJoin
 from rmpa.bridge.topics.reports import is_watched, report_given_up, report_missed, report_oversized, tell_oversized
@@ -48,7 +48,7 @@ from rmpa.core.identity import OWN_NODE, is_own, proxied_node, proxy_name
 from rmpa.core.limits import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ResumeTable
-from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection
+from rmpa.ros.node.subscription import InProcessConnection, PublisherConnection, TopicConnection
 from rmpa.ros.wire.tcpros import ANY, TopicDescription
 from rmpa.runtime.accept import DESCRIPTORS
 from rmpa.runtime.loop import MachineTimer
@@ -56,14 +56,11 @@ from rmpa.runtime.loop import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.data.route_sender import RouteSender
     from rmpa.bridge.messages import Audience, Origin
-    from rmpa.bridge.policy import Relay
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
     from rmpa.ros.core.external import Core
     from rmpa.ros.node.publication import Publication
-    from rmpa.ros.node.subscription import TopicConnection
 
 _log = logging.getLogger(__name__)
 

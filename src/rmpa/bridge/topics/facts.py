@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.bridge.data.quality import QosEventKind, shown_seconds
+from rmpa.bridge.data.quality import QosEventKind, QosWatch, shown_seconds
 from rmpa.bridge.data.route_sender import ReliableRouteSender
 from rmpa.bridge.direct.paths import AGENTS, Condition, Want, unmet_by_contract
 from rmpa.bridge.messages import Source
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.bridge import Bridge
     from rmpa.bridge.data.export import ExportRoute
-    from rmpa.bridge.data.quality import QosWatch
     from rmpa.bridge.offers import PeerRun
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.exports import LocalSource

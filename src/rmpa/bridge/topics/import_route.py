@@ -11,7 +11,7 @@ from msgspec import UnsetType
 
 from rmpa.bridge import limits
 from rmpa.bridge.data.reception import ImportFlow
-from rmpa.bridge.messages import Audience, Source
+from rmpa.bridge.messages import Audience, Description, RouteOpened, Source
 from rmpa.bridge.peer_offers import Remote
 from rmpa.bridge.topics.joins import join
 from rmpa.bridge.topics.reports import audience, compares_names, is_watched
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
     from rmpa.bridge.data.quality import QosEvent, QosWatch
-    from rmpa.bridge.messages import Description, RouteOpened
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.part import Topics
     from rmpa.core.timers import Backoff

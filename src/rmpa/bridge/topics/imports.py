@@ -37,7 +37,7 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.peer_offers import ImportBook
 from rmpa.bridge.policy import is_outside
-from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic
+from rmpa.bridge.topics.import_route import ImportRoute, RemoteTopic, StreamKey
 from rmpa.config.peer_rules import Access
 from rmpa.config.rules import CLOCK
 from rmpa.core.facts import CONFLICT, CROWDED, DENIED
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from rmpa.bridge.data.reception import ImportFlow
-    from rmpa.bridge.topics.import_route import StreamKey
     from rmpa.bridge.topics.part import Topics
 
 _Key = TypeVar("_Key", bound="str | StreamKey")

@@ -14,11 +14,11 @@ from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.data.quality import shown_seconds
+from rmpa.bridge.data.quality import QosWatch, shown_seconds
 from rmpa.bridge.direct.grants import TopicGrants
 from rmpa.bridge.graph_part import GraphPart
-from rmpa.bridge.messages import Audience, CloseRoute, Mismatch, OpenRoute, RouteClosed, RouteOpened
-from rmpa.bridge.policy import Needs
+from rmpa.bridge.messages import Audience, CloseRoute, Message, Mismatch, OpenRoute, RouteClosed, RouteOpened, Source
+from rmpa.bridge.policy import Needs, Place
 from rmpa.bridge.topics.direct import TopicPaths
 from rmpa.bridge.topics.exports import Exports, local_sources
 from rmpa.bridge.topics.imports import Imports
@@ -35,10 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.data.quality import QosWatch
-    from rmpa.bridge.messages import Message, Source
     from rmpa.bridge.peer_offers import Remote
-    from rmpa.bridge.policy import Place
     from rmpa.bridge.sessions import PeerSession
     from rmpa.bridge.topics.import_route import Pasts, RemoteTopic
 

@@ -18,14 +18,14 @@ import msgspec
 
 from rmpa.bridge import limits
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.sessions import Part
+from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.bridge.topics.direct import MEASURING
 from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RmpaError
 from rmpa.core.identity import OWN_NODE, is_own
 from rmpa.ros.http.rpc import call
 from rmpa.ros.node.subscription import PublisherConnection
-from rmpa.ros.wire.slave_api import read_bus_stats, sent_between
+from rmpa.ros.wire.slave_api import Sent, read_bus_stats, sent_between
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tasks import OwnedTasks
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.bridge import Bridge
-    from rmpa.bridge.sessions import PeerSession
-    from rmpa.ros.wire.slave_api import Sent
 
 # The request for the rates of the topics that a module offers: a list of ``TopicRate``.
 RATES: Final = "topic.rates"

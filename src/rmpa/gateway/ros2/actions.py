@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.identity import OWN_NODE, proxy_name
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.format import USUAL_QOS, EntityKind, Ros2Attachment, Ros2Durability, Ros2Qos
+from rmpa.gateway.ros2.format import USUAL_QOS, EntityKind, Ros2Attachment, Ros2Durability, Ros2Endpoint, Ros2Qos
 from rmpa.gateway.ros2.goals import GoalsToRos1, GoalsToRos2
 from rmpa.gateway.ros2.graph import SITE, valid_name
 from rmpa.gateway.ros2.pairs import PART, ActionPair, find_types
-from rmpa.gateway.rules import ForeignSource, SourceKind
-from rmpa.gateway.zenoh.threads import ZenohQos
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
+from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
 from rmpa.ros.types.definitions import Specification, known_specifications
 from rmpa.ros.types.messages import MessageType
 from rmpa.runtime.loop import Delay, MachineTimer, SystemClock
@@ -26,11 +26,8 @@ if TYPE_CHECKING:
 
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.own_graph import TopicTap
-    from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint, Publishing, Query
     from rmpa.gateway.ros2.services import Ros2Context
-    from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import TopicDescription
 
 # Seconds of one goal of an action at a server of ROS 2: a day. A server that dies ends its goals at once.

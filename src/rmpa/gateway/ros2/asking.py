@@ -20,20 +20,16 @@ from rosbags.typesys import get_types_from_msg
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.gateway import limits
 from rmpa.gateway.ros2.conversion import MALFORMED, NoConversion, Ros2Codec
-from rmpa.gateway.ros2.format import EntityKind, gid_of
-from rmpa.gateway.ros2.graph import SITE
+from rmpa.gateway.ros2.format import EntityKind, Ros2Endpoint, Ros2Node, gid_of
+from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph
 from rmpa.gateway.ros2.pairs import described_types
-from rmpa.gateway.ros2.types import Ros2Types, check_size, ros2_fields
-from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.ros2.types import Fields, Ros2Types, check_size, ros2_fields
+from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
 from rmpa.ros.limits import DEFINITION_FIELDS_MAX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.gateway.ros2.format import Ros2Endpoint, Ros2Node
-    from rmpa.gateway.ros2.graph import OwnRos2Nodes, Ros2Graph
-    from rmpa.gateway.ros2.types import Fields
-    from rmpa.gateway.rules import CrossingRules
     from rmpa.gateway.zenoh.threads import ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
 

@@ -18,16 +18,14 @@ from rosbags.serde import SerdeError
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import UINT32_MAX
 from rmpa.gateway.ros2.transcoder import HEAD, LayoutPart, Transcoder
-from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, Ros2Field, check_size, snake_case
+from rmpa.gateway.ros2.types import EMPTY_MEMBER, TIMES, FieldPaths, Ros2Field, Ros2Types, check_size, snake_case
 from rmpa.ros.types.codec import MessageCodec
-from rmpa.ros.types.definitions import Specification
+from rmpa.ros.types.definitions import Field, Specification
 from rmpa.ros.types.values import CODES, SIZES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.gateway.ros2.types import FieldPaths, Ros2Types
-    from rmpa.ros.types.definitions import Field
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import Buffer
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from msgspec import UNSET
 
-from rmpa.core.contract import Durability, History, Liveliness, Reliability
+from rmpa.core.contract import Contract, Contracts, Durability, History, Liveliness, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.gateway import limits
 from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohQos
@@ -32,7 +32,6 @@ from rmpa.gateway.zenoh.threads import PRIORITIES, ZenohQos
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.core.contract import Contract, Contracts
     from rmpa.ros.wire.tcpros import Buffer
 
 # Bytes of the source's GID in an attachment of ROS 2: its length is one byte.

@@ -10,7 +10,7 @@ import itertools
 import re
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from rmpa.bridge.policy import Needs
 from rmpa.config.rules import ROS2
@@ -27,17 +27,15 @@ from rmpa.gateway.ros2.format import (
     gid_of,
     parse_token,
 )
-from rmpa.gateway.zenoh.threads import first_answer
+from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohSample, first_answer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from contextlib import ExitStack
-    from typing import TypeAlias
 
     from rmpa.gateway.ros2.format import Ros2Qos
     from rmpa.gateway.ros2.rclpy_session import RclpyPublisher, RclpyQuery, RclpySession
     from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
-    from rmpa.gateway.zenoh.threads import QueuedPublisher, ZenohSample
     from rmpa.ros.wire.tcpros import Buffer
 
     Ros2Link: TypeAlias = OpenSession | RclpySession

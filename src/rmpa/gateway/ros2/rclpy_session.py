@@ -40,7 +40,7 @@ from rmpa.gateway.ros2.format import (
     qos_of_fields,
     ros_type,
 )
-from rmpa.gateway.zenoh.threads import ZenohSample
+from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
 from rmpa.runtime.stream import Stream
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.bridge.policy import Needs
-    from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.runtime.tls import Buffer
 
 _log = logging.getLogger(__name__)

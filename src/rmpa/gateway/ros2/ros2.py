@@ -24,12 +24,12 @@ from rmpa.gateway.ros2.graph import SITE
 from rmpa.gateway.ros2.pairs import PART
 from rmpa.gateway.ros2.rclpy_session import RclpySession, shown_in_ros2
 from rmpa.gateway.ros2.services import Ros2Context, Ros2Services
-from rmpa.gateway.ros2.topics import Ros2Topics
+from rmpa.gateway.ros2.topics import Ros2Export, Ros2Import, Ros2Publisher, Ros2Topics
 from rmpa.gateway.ros2.types import DISTRIBUTIONS
-from rmpa.gateway.rules import CrossingRules, SourceKind
+from rmpa.gateway.rules import CrossingRules, MeshSource, SourceKind
 from rmpa.gateway.topics import flow
 from rmpa.observe.check import FAIL, OK, WARN, Check
-from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteSourceInfo, SitesReport
+from rmpa.observe.sites import PARAM, REPORT, SITE_INFO, SITE_WHY, SiteAnswerer, SiteInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 from rmpa.ros.types.find import find_message_type
 
@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.ros2.graph import Declared, Ros2Link
-    from rmpa.gateway.ros2.topics import Ros2Export, Ros2Import, Ros2Publisher
-    from rmpa.gateway.rules import MeshSource
-    from rmpa.observe.sites import SiteAnswerer
     from rmpa.ros.types.messages import MessageType
 
 _log: Final = logging.getLogger(__name__)

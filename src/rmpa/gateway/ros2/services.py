@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.gateway import limits
-from rmpa.gateway.foreign import Answering
+from rmpa.gateway.foreign import Answering, ProxiedService
 from rmpa.gateway.ros2.asking import Ros2Asker
 from rmpa.gateway.ros2.conversion import NoConversion
-from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment
+from rmpa.gateway.ros2.format import GID_BYTES, EntityKind, Ros2Attachment, Ros2Endpoint
 from rmpa.gateway.ros2.graph import SITE, OwnRos2Nodes, Ros2Graph, valid_name
 from rmpa.gateway.ros2.pairs import ActionPair, Ros2Pairs, ServicePair, TypeMapping
 from rmpa.gateway.ros2.types import WITHOUT_HASH, Ros2Types, TypePair
-from rmpa.gateway.rules import CrossingRules, ForeignSource, SourceKind
+from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKind
 from rmpa.ros.types.find import find_service_type
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -32,11 +32,8 @@ if TYPE_CHECKING:
 
     from rmpa.config.rules import GatewaySettings
     from rmpa.core.contract import Contracts
-    from rmpa.gateway.foreign import ProxiedService
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.ros2.format import Ros2Endpoint
     from rmpa.gateway.ros2.graph import OwnEndpoint, Query, Ros2Link
-    from rmpa.gateway.rules import MeshSource
     from rmpa.ros.types.messages import MessageType
     from rmpa.ros.wire.tcpros import ServiceDescription
 

@@ -23,24 +23,20 @@ from rmpa.gateway.ros2.format import (
     ros2_qos,
     zenoh_qos,
 )
-from rmpa.gateway.ros2.graph import SITE, mismatch, valid_name
+from rmpa.gateway.ros2.graph import SITE, OwnEndpoint, mismatch, valid_name
 from rmpa.gateway.ros2.types import Ros2Sequences
-from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.rules import CrossingDecision, ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.topics import ExportedTopic, TopicLimits
-from rmpa.gateway.zenoh.threads import BoundedQueue
+from rmpa.gateway.zenoh.threads import BoundedQueue, ZenohQos, ZenohSample
 from rmpa.ros.types.find import type_of_header
-from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 from rmpa.runtime.loop import Delay
 
 if TYPE_CHECKING:
     from rmpa.gateway.foreign import ProxiedTopic
     from rmpa.gateway.ros2.format import Ros2Endpoint
-    from rmpa.gateway.ros2.graph import OwnEndpoint
     from rmpa.gateway.ros2.services import Ros2Context
-    from rmpa.gateway.rules import CrossingDecision, MeshSource
-    from rmpa.gateway.zenoh.threads import ZenohQos, ZenohSample
     from rmpa.ros.types.messages import MessageType
-    from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds for a publisher's answer whether it is latched.
 _LATCH_LOOK_TIMEOUT: Final = 10.0

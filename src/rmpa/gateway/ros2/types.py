@@ -13,15 +13,13 @@ from rosbags.typesys.store import Typestore
 
 from rmpa.core.errors import ConfigError, RemoteProtocolError
 from rmpa.gateway import limits
-from rmpa.gateway.ros2.format import NO_HASH
+from rmpa.gateway.ros2.format import NO_HASH, Ros2Attachment
 from rmpa.ros.limits import DEFINITION_DEPTH_MAX
-from rmpa.ros.types.definitions import Field
+from rmpa.ros.types.definitions import Field, Specification
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.gateway.ros2.format import Ros2Attachment
-    from rmpa.ros.types.definitions import Specification
     from rmpa.ros.types.installed import ServiceType
 
 

@@ -22,29 +22,25 @@ from rmpa.config.peer_rules import Access
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.identity import is_global_name
 from rmpa.gateway import limits
-from rmpa.gateway.rules import ACCESS, CrossingRules, SourceKind
-from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway, read_json
+from rmpa.gateway.rules import ACCESS, CrossingRules, MeshSource, SourceKind
+from rmpa.gateway.sites.keys import GATEWAY, ROOT, SiteGateway, SiteModule, SiteSource, read_json
 from rmpa.gateway.sites.services import ImportedService
 from rmpa.gateway.sites.site import SiteNeighbour
 from rmpa.gateway.sites.topics import ImportedTopic, SiteContext
-from rmpa.gateway.topics import flow
+from rmpa.gateway.topics import ExportedTopic, flow
 from rmpa.gateway.zenoh.threads import first_answer
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
 from rmpa.observe.sites import REPORT, SITE_INFO, SITE_WHY, SiteInfo, SiteModuleInfo, SiteSourceInfo, SitesReport
 from rmpa.observe.why.diagnosis import Diagnosis, permission_there, until_failure
-from rmpa.ros.wire.tcpros import printable
+from rmpa.ros.wire.tcpros import Buffer, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.config.settings import Settings
     from rmpa.gateway.own_graph import AgentGraph
-    from rmpa.gateway.rules import MeshSource
-    from rmpa.gateway.sites.keys import SiteModule, SiteSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.topics import ExportedTopic
     from rmpa.gateway.zenoh.session import ArrivedQuery, OpenSession
-    from rmpa.ros.wire.tcpros import Buffer
 
 # Seconds for a question to another site's gateway.
 _SITE_ASK_TIMEOUT: Final = 5.0

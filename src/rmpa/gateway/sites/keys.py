@@ -29,12 +29,11 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_global_name, is_type_name, peer_name_problem
 from rmpa.gateway import limits
 from rmpa.gateway.rules import SourceKind
-from rmpa.ros.wire.tcpros import TopicDescription, printable
+from rmpa.ros.wire.tcpros import Buffer, TopicDescription, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.ros.wire.tcpros import Buffer
 
 VERSION: Final = 1
 _LATCHED: Final = 1

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
-from rmpa.gateway.rules import ForeignSource, SourceKind
+from rmpa.gateway.rules import CrossingRules, ForeignSource, MeshSource, SourceKey, SourceKind
 from rmpa.gateway.sites.keys import UNKNOWN_TYPE, SiteModule, SiteSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rmpa.gateway.rules import CrossingRules, MeshSource, SourceKey
 
 # Bytes of a node's name in an attachment.
 _NODE_NAME_MAX: Final = 255

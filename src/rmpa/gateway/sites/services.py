@@ -27,20 +27,18 @@ from rmpa.core.errors import PeerRefused, RemoteProtocolError
 from rmpa.core.identity import is_type_name
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
-from rmpa.gateway.rules import SourceKind
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.keys import ROOT, TO, UNKNOWN_TYPE, AttachmentReader, MessageSource, data_key, read_json
 from rmpa.gateway.zenoh.threads import ZenohPriority, first_answer
 from rmpa.ros import limits as ros_limits
-from rmpa.ros.wire.tcpros import ServiceDescription
+from rmpa.ros.wire.tcpros import Buffer, ServiceDescription
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
     from rmpa.gateway.own_graph import AgentGraph, TopicTap
-    from rmpa.gateway.rules import ForeignSource, MeshSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.session import ArrivedQuery
-    from rmpa.ros.wire.tcpros import Buffer
 
 # Bytes of the description of another site's service: four names.
 _SERVICE_DESCRIPTION_MAX: Final = 8192

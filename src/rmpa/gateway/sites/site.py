@@ -10,20 +10,17 @@ import rmpa
 from rmpa.core.log import RefusalLog, logged_failure
 from rmpa.core.timers import earliest
 from rmpa.gateway import limits
-from rmpa.gateway.rules import SourceKind
+from rmpa.gateway.rules import ForeignSource, MeshSource, SourceKind
 from rmpa.gateway.sites.catalogue import Leader, SiteCatalogue
 from rmpa.gateway.sites.keys import ANY_GATEWAY, ROOT, SiteGateway, SiteModule, token_keys
-from rmpa.gateway.sites.plans import SiteExports, SiteImports
+from rmpa.gateway.sites.plans import SiteExport, SiteExports, SiteImport, SiteImports
 from rmpa.gateway.sites.services import ImportedService, SiteActions, SiteServices
-from rmpa.gateway.sites.topics import ImportedTopic, SiteTopics
+from rmpa.gateway.sites.topics import ImportedTopic, SiteContext, SiteTopics
 from rmpa.runtime.loop import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.gateway.rules import ForeignSource, MeshSource
-    from rmpa.gateway.sites.plans import SiteExport, SiteImport
-    from rmpa.gateway.sites.topics import SiteContext
     from rmpa.gateway.zenoh.session import Declaration
 
 _log = logging.getLogger(__name__)

@@ -10,31 +10,27 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.bridge.policy import Needs
+from rmpa.bridge.policy import BridgeContext, Needs
 from rmpa.config.peer_rules import Access
-from rmpa.core.contract import Priority, Reliability
+from rmpa.core.contract import Contract, Contracts, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.gateway import limits
 from rmpa.gateway.foreign import Answering
 from rmpa.gateway.sites.keys import ROOT, AttachmentReader, MessageSource, SequenceCounter, TopicHeader
 from rmpa.gateway.topics import ExportedTopic
-from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, first_answer
-from rmpa.ros.wire.tcpros import printable
+from rmpa.gateway.zenoh.threads import PRIORITIES, BoundedQueue, ZenohPriority, ZenohQos, ZenohSample, first_answer
+from rmpa.ros.wire.tcpros import TopicDescription, printable
 from rmpa.runtime.loop import Delay
 from rmpa.runtime.tasks import keep_task
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.policy import BridgeContext
-    from rmpa.core.contract import Contract, Contracts
     from rmpa.core.statistics import Counters
     from rmpa.gateway.own_graph import AgentGraph
     from rmpa.gateway.rules import CrossingRules, ForeignSource
     from rmpa.gateway.sites.plans import SiteExport, SiteImport
     from rmpa.gateway.zenoh.session import ArrivedQuery, Declaration, OpenSession
-    from rmpa.gateway.zenoh.threads import ZenohSample
-    from rmpa.ros.wire.tcpros import TopicDescription
 
 # Seconds that a query for a publisher's header waits for it: the gateway there connects to the publisher first.
 _HEADER_TIMEOUT: Final = 5.0

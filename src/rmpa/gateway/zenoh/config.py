@@ -17,7 +17,7 @@ from rmpa.config.peer_rules import Effect
 from rmpa.core.errors import RemoteProtocolError, StartError
 from rmpa.gateway import limits
 from rmpa.trust.limits import CERTIFICATE_LIFETIME, RENEWAL_SHARE
-from rmpa.trust.store import CA, CERTIFICATE, DENY, KEY
+from rmpa.trust.store import CA, CERTIFICATE, DENY, KEY, MemberFiles
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rmpa.config.rules import GatewaySettings
     from rmpa.config.settings import Settings
     from rmpa.trust.certificates import DenyList
-    from rmpa.trust.store import MemberFiles
 
 _log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import StartError, missing_extra
 from rmpa.gateway import limits
-from rmpa.gateway.zenoh.config import bound_unsent, reason_of, session_config
+from rmpa.gateway.zenoh.config import ZenohConfig, bound_unsent, reason_of, session_config
 from rmpa.gateway.zenoh.threads import (
     ArrivalQueue,
     Arrivals,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.policy import Needs
     from rmpa.config.settings import Settings
-    from rmpa.gateway.zenoh.config import ZenohConfig
     from rmpa.gateway.zenoh.threads import ZenohQos
     from rmpa.ros.wire.tcpros import Buffer
 

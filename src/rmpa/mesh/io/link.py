@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.facts import LinkInfo
-from rmpa.core.identity import SERIAL_MASK
+from rmpa.core.identity import SERIAL_MASK, Guid, Identity
 from rmpa.core.limits import KIB, MIB
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.core.timers import Backoff
 from rmpa.mesh import limits
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionState
-from rmpa.mesh.frames import Frame, FrameKind, Lane, Link
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionState, DataHandler
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Lane, Link, Refuse
 from rmpa.mesh.io.lane import LaneSender, bound_queue
-from rmpa.mesh.peering import REPLACED, RESTARTED
+from rmpa.mesh.peering import REPLACED, RESTARTED, SocketAddress
 from rmpa.runtime.loop import MachineTimer
 from rmpa.runtime.stream import Stream
 
@@ -26,11 +26,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from rmpa.core.identity import Guid, Identity
-    from rmpa.mesh.connection import DataHandler
-    from rmpa.mesh.frames import Hello, Refuse
     from rmpa.mesh.io.mesh import Mesh
-    from rmpa.mesh.peering import SocketAddress
     from rmpa.runtime.tls import SecureSocket
     from rmpa.trust.certificates import ModuleCertificate
 

@@ -13,12 +13,12 @@ from rmpa.core import codes
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.mesh import limits
-from rmpa.mesh.frames import FULL, Lane, Refusal, Refuse
+from rmpa.mesh.frames import FULL, Hello, Lane, Refusal, Refuse
 from rmpa.mesh.io.lane import Dialler
 from rmpa.mesh.io.link import Connection, LinkHandlers, PeerLink
-from rmpa.mesh.io.securing import Securing, SecuringError, tls_failure
+from rmpa.mesh.io.securing import OnJoin, SecuredSocket, Securing, SecuringError, tls_failure
 from rmpa.mesh.keepalive import Pace
-from rmpa.mesh.peering import REPLACED, Peering, PeeringOutput
+from rmpa.mesh.peering import REPLACED, Peering, PeeringOutput, SocketAddress
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.loop import MachineTimer, SystemClock
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.core.identity import Guid, Identity
-    from rmpa.mesh.frames import Hello
-    from rmpa.mesh.io.securing import OnJoin, SecuredSocket
-    from rmpa.mesh.peering import SocketAddress
     from rmpa.trust.membership import Membership
 
 _log = logging.getLogger(__name__)

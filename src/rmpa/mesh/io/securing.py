@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 from rmpa.core.timers import TokenBucket
 from rmpa.mesh import limits
-from rmpa.mesh.frames import Frame, FrameKind, Refusal, Refuse
+from rmpa.mesh.frames import Frame, FrameKind, Hello, Refusal, Refuse
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.runtime.tls import SecureSocket, TlsHandshake
 from rmpa.trust.permissions import TrustError, TrustReason
 from rmpa.trust.store import ALPN_JOIN, ALPN_LINK
 
 if TYPE_CHECKING:
-    from rmpa.mesh.frames import Hello
     from rmpa.mesh.io.link import Connection
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.peering import SocketAddress

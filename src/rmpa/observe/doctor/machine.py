@@ -31,7 +31,7 @@ from rmpa.observe.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback, shown_uri
 from rmpa.ros.http.rpc import call, call_api
-from rmpa.ros.master.mirror import read_survey, survey_calls
+from rmpa.ros.master.mirror import Survey, read_survey, survey_calls
 from rmpa.ros.master.parameters import RegistrationKind
 from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.loop import REALTIME_REMEDY
@@ -39,8 +39,6 @@ from rmpa.runtime.systemd import INSTALL, START, UNIT, is_set_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from rmpa.ros.master.mirror import Survey
 
 
 # The name under which a core is asked.

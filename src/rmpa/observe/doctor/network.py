@@ -26,18 +26,15 @@ import psutil
 from rmpa.core.errors import StartError
 from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
-from rmpa.discovery.network import CONTAINERS, choose, join_group, list_interfaces, open_receiver, receive
+from rmpa.discovery.network import CONTAINERS, Interface, choose, join_group, list_interfaces, open_receiver, receive
 from rmpa.mesh.io.lane import may_use_bbr, repeats_quickly
 from rmpa.observe import limits
 from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
-from rmpa.observe.doctor.machine import ask_program, resolve
+from rmpa.observe.doctor.machine import DoctorInput, ask_program, resolve
 from rmpa.runtime.kernel_tcp import program_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-
-    from rmpa.discovery.network import Interface
-    from rmpa.observe.doctor.machine import DoctorInput
 
 
 _TUNNELS: Final = re.compile(r"(tun|tap|wg|zt|tailscale|ppp|utun|nordlynx|proton)")

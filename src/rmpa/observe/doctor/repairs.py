@@ -28,13 +28,12 @@ from rmpa.core.identity import peer_name_problem
 from rmpa.observe import limits
 from rmpa.observe.check import OK, WARN, Check
 from rmpa.observe.control_client import closed_to_us, runtime_dir, runtime_dirs
-from rmpa.observe.doctor.machine import read_unit
+from rmpa.observe.doctor.machine import DoctorInput, read_unit
 from rmpa.runtime.systemd import UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from rmpa.observe.doctor.machine import DoctorInput
 
 _LOCKS: Final = Path("/proc/locks")
 _ANEW: Final = "nothing: the next agent of that name makes them again"

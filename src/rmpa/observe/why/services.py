@@ -20,7 +20,7 @@ from rmpa.bridge import limits
 from rmpa.config.peer_rules import Access
 from rmpa.core.identity import is_meant
 from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
-from rmpa.observe.snapshot import ModuleFacts
+from rmpa.observe.snapshot import ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     Diagnosis,
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.core.facts import LinkInfo, ServiceInfo
-    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.why.diagnosis import ServiceAtServer
 
 # Percent of a core from which on an agent counts as busy: it has one thread for all messages.

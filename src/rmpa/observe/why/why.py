@@ -14,12 +14,12 @@ from rmpa.config import limits as config_limits
 from rmpa.config.peer_rules import Access
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
-from rmpa.core.facts import DENIED
+from rmpa.core.facts import DENIED, Arrival, PublisherReport
 from rmpa.core.identity import OWN_NODE, is_global_name, is_own
 from rmpa.observe import limits as observe_limits
 from rmpa.observe.check import FAIL, OK, Check
-from rmpa.observe.sites import SITE_WHY
-from rmpa.observe.snapshot import INFO, ModuleFacts
+from rmpa.observe.sites import SITE_WHY, SiteRequests
+from rmpa.observe.snapshot import INFO, ModuleFacts, PeerInfo, Snapshot
 from rmpa.observe.why.diagnosis import (
     PERMISSION_THERE,
     Diagnosis,
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.facts import BridgeFacts
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.core.facts import Arrival, PublisherReport
-    from rmpa.observe.sites import SiteRequests
-    from rmpa.observe.snapshot import PeerInfo, Snapshot
     from rmpa.observe.snapshot_builder import SnapshotBuilder
 
 _T = TypeVar("_T")

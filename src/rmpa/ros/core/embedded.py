@@ -20,7 +20,7 @@ from rmpa.ros.core.liveness import Notifier
 from rmpa.ros.core.state import CoreState
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, RegistrationKind
 from rmpa.ros.node.loggers import serve_loggers
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode, Subscription
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from rmpa.ros.master.parameters import GraphChange
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 

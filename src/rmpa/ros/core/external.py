@@ -19,10 +19,10 @@ from rmpa.core.facts import UnreachableInfo
 from rmpa.core.log import logged_failure
 from rmpa.core.statistics import Counters
 from rmpa.ros import limits
-from rmpa.ros.core.liveness import Liveness
+from rmpa.ros.core.liveness import Liveness, Unreachable
 from rmpa.ros.http.rpc import call, call_api, exchange, read_response
 from rmpa.ros.master import mirror
-from rmpa.ros.master.parameters import RegistrationKind
+from rmpa.ros.master.parameters import GraphChange, GraphState, RegistrationKind
 from rmpa.ros.node.ask import refuses
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.accept import Use
@@ -32,8 +32,6 @@ from rmpa.runtime.tasks import end_tasks, keep_task
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.ros.core.liveness import Unreachable
-    from rmpa.ros.master.parameters import GraphChange, GraphState
     from rmpa.ros.master.registrations import Registrations
 
 _log = logging.getLogger(__name__)

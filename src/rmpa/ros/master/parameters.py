@@ -6,13 +6,11 @@ Calls to slave APIs that follow from a change in the master's tables, and report
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from rmpa.core.timers import Yielder
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 

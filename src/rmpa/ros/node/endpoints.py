@@ -8,7 +8,7 @@ import inspect
 import logging
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -21,22 +21,17 @@ from rmpa.ros.http.rpc import call, call_api
 from rmpa.ros.master.mirror import one_call
 from rmpa.ros.node.publication import Publication, PublicationEvents
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
-from rmpa.ros.node.slave_node import Subscription
+from rmpa.ros.node.slave_node import SlaveNode, Subscription
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
-from rmpa.ros.types.messages import HeaderNumbers, given_values
-from rmpa.ros.wire.tcpros import ANY, LENGTH, TopicDescription, frame_message, printable
+from rmpa.ros.types.messages import HeaderNumbers, MessageType, Plain, given_values
+from rmpa.ros.wire.tcpros import ANY, LENGTH, Buffer, TopicDescription, frame_message, printable
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
-
     from rmpa.ros.node.service_client import ServiceConnection
-    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.node.subscription import PublisherConnection
     from rmpa.ros.types.installed import ServiceType
-    from rmpa.ros.types.messages import MessageType, Plain
-    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)

@@ -19,15 +19,13 @@ from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError, Unreac
 from rmpa.core.identity import OWN_NODE
 from rmpa.ros.http.rpc import call_api
 from rmpa.ros.node.service_client import ServiceConnection
-from rmpa.ros.node.service_server import ServiceEndpoint
-from rmpa.ros.wire.tcpros import LENGTH, ServiceDescription, pack_text, printable
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.wire.tcpros import LENGTH, Buffer, ServiceDescription, pack_text, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rmpa.ros.node.service_server import ServiceCall
     from rmpa.ros.node.slave_node import SlaveNode
-    from rmpa.ros.wire.tcpros import Buffer
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)

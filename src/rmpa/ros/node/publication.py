@@ -13,22 +13,20 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from rmpa.core.log import logged_failure
-from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.outbox import URGENT, Outbox, QueuedMessage
 from rmpa.ros import limits
 from rmpa.ros.http.rpc import keep_alive, tcpros_info
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, encode_header, printable, publisher_header
 from rmpa.runtime import limits as runtime_limits
-from rmpa.runtime.stream import Stream
+from rmpa.runtime.stream import OnBytes, Stream
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
 
-    from rmpa.core.outbox import QueuedMessage
     from rmpa.ros.node.subscription import InProcessConnection
     from rmpa.ros.wire.tcpros import Buffer, Header
     from rmpa.ros.wire.xmlrpc import RosReply
-    from rmpa.runtime.stream import OnBytes
 
     SubscriberConnection: TypeAlias = "AcceptedConnection | InProcessConnection"
 

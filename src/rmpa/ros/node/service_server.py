@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config import limits as config_limits
@@ -17,8 +17,6 @@ from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.tasks import start_task
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
     from rmpa.ros.node.publication import AcceptedConnection
     from rmpa.runtime.stream import Stream
 

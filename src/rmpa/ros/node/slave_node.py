@@ -15,11 +15,11 @@ from rmpa.core.statistics import Counters
 from rmpa.ros import limits
 from rmpa.ros.http.server import XmlRpcServer, listen
 from rmpa.ros.node.ask import read_header
-from rmpa.ros.node.publication import AcceptedConnection
-from rmpa.ros.node.subscription import PublisherConnection
-from rmpa.ros.wire.slave_api import METHODS, TCPROS, bus_info, bus_stats, check_call
-from rmpa.ros.wire.tcpros import ANY, ANYTHING, check_request, printable
-from rmpa.ros.wire.xmlrpc import RosFault
+from rmpa.ros.node.publication import AcceptedConnection, Publication
+from rmpa.ros.node.subscription import PublisherConnection, TopicConnection
+from rmpa.ros.wire.slave_api import METHODS, TCPROS, BusConnection, bus_info, bus_stats, check_call
+from rmpa.ros.wire.tcpros import ANY, ANYTHING, TopicDescription, check_request, printable
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue
 from rmpa.runtime.accept import Acceptor, Use
 from rmpa.runtime.tasks import OwnedTasks
 
@@ -28,12 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
     from rmpa.ros.node.listeners import SharedListener
-    from rmpa.ros.node.publication import Publication
     from rmpa.ros.node.service_server import ServiceEndpoint
-    from rmpa.ros.node.subscription import TopicConnection
-    from rmpa.ros.wire.slave_api import BusConnection
-    from rmpa.ros.wire.tcpros import TopicDescription
-    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
 

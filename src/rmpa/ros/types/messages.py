@@ -26,14 +26,13 @@ from rmpa.ros.types.definitions import (
     parse_definition,
 )
 from rmpa.ros.types.values import GivenMessage, WrongValueError, ros2_name
-from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.ros.wire.tcpros import Buffer, TopicDescription
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rosbags.typesys.store import Typestore
 
-    from rmpa.ros.wire.tcpros import Buffer
 
 # Message types from texts in the cache of a process; the least recently used is dropped.
 _LEARNT_TYPES_MAX: Final = 512

@@ -8,15 +8,13 @@ import functools
 import math
 import struct
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.limits import MIB, UINT32_MAX
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rmpa.ros.types.definitions import Field, Specification
 
 # Bytes of a message that is written from values.

@@ -6,13 +6,10 @@ Each message of roscpp has the names of all topics of its node behind that, whic
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.wire.tcpros import LENGTH
-
-if TYPE_CHECKING:
-    from rmpa.ros.wire.tcpros import Buffer
+from rmpa.ros.wire.tcpros import LENGTH, Buffer
 
 # The message's length, and its header: seq, the stamp's seconds and nanoseconds, the length of frame_id.
 _BEGIN: Final = struct.Struct("<IIIII")

@@ -9,10 +9,10 @@ from __future__ import annotations
 import base64
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, Union, cast
+from typing import Final, NamedTuple, TypeAlias, Union, cast
 from xml.parsers.expat import ExpatError
 from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
@@ -22,10 +22,6 @@ from defusedxml.xmlrpc import DefusedExpatParser
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError, RmpaError
 from rmpa.core.limits import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
 
 # Writes values as XML-RPC, piece by piece, so that other work can be done between two pieces. The text is exactly
 # that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser compares strings, and

@@ -16,8 +16,8 @@ from rmpa.core.identity import is_type_name
 from rmpa.web import limits as web_limits
 from rmpa.web.foxglove import limits
 from rmpa.web.foxglove.protocol import ENCODING, SCHEMA_ENCODING, WARNING, message, status
-from rmpa.web.hub.hub import HubClient
-from rmpa.web.hub.node_link import READ_ONLY
+from rmpa.web.hub.hub import Hub, HubClient
+from rmpa.web.hub.node_link import READ_ONLY, Follower
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.connection import Session
     from rmpa.web.hub.frame_writer import OutFrame
-    from rmpa.web.hub.hub import Hub
-    from rmpa.web.hub.node_link import Follower
 
 _SEPARATOR: Final = "=" * 80
 # A type's name, whether it is a service's, and the md5 sum of its version; "" for the one that is known best.

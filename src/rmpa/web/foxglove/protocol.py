@@ -20,13 +20,12 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.identity import is_global_name
 from rmpa.core.limits import INT32_MAX, INT32_MIN, UINT32_MAX
 from rmpa.web.foxglove import limits
-from rmpa.web.hub.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode, OutFrame
 from rmpa.web.hub.params import as_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import ParamValue, Payload
 
 # The names of the WebSocket subprotocol, preferred first; the messages here are the same in both.

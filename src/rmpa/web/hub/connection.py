@@ -19,26 +19,21 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias, get_type_hints
 
 import msgspec
-from aiohttp import WebSocketError, WSCloseCode, WSMsgType
+from aiohttp import WebSocketError, WSCloseCode, WSMsgType, web
 
 from rmpa.core.errors import RmpaError
 from rmpa.core.limits import KIB, MIB
 from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
-from rmpa.web.hub.frame_writer import FairQueue, FrameWriter, Opcode, OutFrame, size_of
-from rmpa.web.hub.hub import HubClient
-from rmpa.web.server.access import guard_of
+from rmpa.web.hub.frame_writer import FairQueue, FrameSocket, FrameWriter, Opcode, OutFrame, size_of
+from rmpa.web.hub.hub import Hub, HubClient
+from rmpa.web.server.access import GuardedConnection, guard_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from aiohttp import web
-
-    from rmpa.web.hub.frame_writer import FrameSocket
-    from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Payload, Rights
     from rmpa.web.hub.topics import ReceivedMessage
-    from rmpa.web.server.access import GuardedConnection
 
 _log = logging.getLogger(__name__)
 # Pings without an answer, behind which no further one is sent: they wait as the client's frames do.

@@ -11,7 +11,7 @@ import asyncio
 import logging
 import struct
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import islice
@@ -25,7 +25,6 @@ from rmpa.web import limits
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Awaitable, Callable, Iterable, Mapping
 
     from rmpa.web.hub.node_link import Payload
 

@@ -17,26 +17,22 @@ from rmpa.observe.graph import GraphRows, ServiceRow, TopicRow
 from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.rpc import exchange, read_response
 from rmpa.ros.node.fetch_type import fetch_type
-from rmpa.ros.types.codec import codec_for
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.definitions import UnknownTypeError, known_text
 from rmpa.ros.types.find import find_message_type, find_service_type, type_of_header
 from rmpa.ros.types.installed import ServiceType, known_services
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import ANY
-from rmpa.ros.wire.xmlrpc import RosReply, call_pieces
+from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, call_pieces
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Follower
-from rmpa.web.hub.services import SharedTasks
+from rmpa.web.hub.node_link import Follower, NodeLink
+from rmpa.web.hub.services import ServiceCalls, SharedTasks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from rmpa.ros.node.node import Node
-    from rmpa.ros.types.codec import MessageCodec
-    from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.node_link import NodeLink
-    from rmpa.web.hub.services import ServiceCalls
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")

@@ -11,27 +11,24 @@ import weakref
 from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias, TypeVar
 
 from rmpa.config.peer_rules import Access
-from rmpa.core.contract import Priority
+from rmpa.core.contract import Contracts, Priority
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
 from rmpa.runtime.tasks import OwnedTasks
 from rmpa.web import limits
-from rmpa.web.hub.frame_writer import size_of
+from rmpa.web.hub.frame_writer import OutFrame, size_of
 from rmpa.web.hub.graph import GraphWatch, TypeLibrary
 from rmpa.web.hub.node_link import CONTROL_REMEDY, EVERYTHING, READ_REMEDY, NodeLink
 from rmpa.web.hub.params import ParamMirror, RosTime, ros_time, value_at
 from rmpa.web.hub.services import ServedService, ServiceCalls, read_asset
-from rmpa.web.hub.topics import HubTopics, MadeOnce
+from rmpa.web.hub.topics import ClientPublication, ClientSubscription, HubTopics, MadeOnce, ReceivedMessage
 from rmpa.web.hub.transforms import TransformTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping
     from types import TracebackType
 
-    from rmpa.core.contract import Contracts
-    from rmpa.web.hub.frame_writer import OutFrame
     from rmpa.web.hub.node_link import Follower, MakeNode, NodeRules, ParamValue, Payload, Rights, Where
-    from rmpa.web.hub.topics import ClientPublication, ClientSubscription, ReceivedMessage
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")

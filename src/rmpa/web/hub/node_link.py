@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypeVar, Union
 
@@ -16,8 +16,6 @@ from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 from rmpa.web import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Coroutine
-
     from rmpa.ros.node.node import Node, Publisher, Service, Subscriber
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
     from rmpa.trust.permissions import Permissions

@@ -16,12 +16,11 @@ from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.master.parameters import Parameters, leaves
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Follower
+from rmpa.web.hub.node_link import Follower, NodeLink, ParamValue
 
 if TYPE_CHECKING:
     from rmpa.ros.node.node import Node
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.web.hub.node_link import NodeLink, ParamValue
     from rmpa.web.hub.topics import ClientSubscription, HubTopics, ReceivedMessage
 
 _log = logging.getLogger(__name__)

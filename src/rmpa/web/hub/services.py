@@ -16,14 +16,13 @@ from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.runtime.tasks import end_tasks, start_task
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.node_link import NodeLink, Payload, Registration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 
     from rmpa.ros.node.node import Node, Service
     from rmpa.ros.types.installed import ServiceType
-    from rmpa.web.hub.node_link import NodeLink, Payload
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")

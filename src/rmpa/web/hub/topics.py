@@ -14,22 +14,19 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import msgspec
 
 from rmpa.config.peer_rules import Access
-from rmpa.core.errors import PeerRefused
+from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.limits import MIB
 from rmpa.core.log import logged_failure
-from rmpa.ros.types.messages import HeaderNumbers
+from rmpa.ros.types.messages import HeaderNumbers, MessageType
 from rmpa.ros.wire.tcpros import ANY
 from rmpa.web import limits
-from rmpa.web.hub.node_link import Registration
+from rmpa.web.hub.node_link import NodeLink, Payload, Registration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.core.errors import RmpaError
     from rmpa.ros.node.node import Node, Publisher, Subscriber
-    from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.graph import GraphWatch, TypeLibrary
-    from rmpa.web.hub.node_link import NodeLink, Payload
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import RmpaError
-from rmpa.ros.types.codec import codec_for
+from rmpa.ros.types.codec import MessageCodec, codec_for
 from rmpa.ros.types.values import CODES, Written, WrongValueError
 from rmpa.web.monitor import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.ros.types.codec import MessageCodec
     from rmpa.ros.types.messages import MessageType
     from rmpa.web.hub.connection import Session
     from rmpa.web.hub.topics import ClientPublication

@@ -19,7 +19,7 @@ from rmpa.core.timers import TokenBucket
 from rmpa.web.hub.connection import Session, decoder_of, ops_of
 from rmpa.web.hub.frame_writer import Opcode
 from rmpa.web.monitor import limits
-from rmpa.web.monitor.driving import TWIST, Command, Driver, Joystick, type_driven
+from rmpa.web.monitor.driving import TWIST, Command, Driver, Joystick, Stick, type_driven
 from rmpa.web.monitor.layers import watch_of
 from rmpa.web.monitor.messages import VERSION, Tree, WatchState, difference
 from rmpa.web.monitor.publishing import FieldError, PagePublications
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from rmpa.web.hub.hub import Hub
     from rmpa.web.hub.node_link import Rights
     from rmpa.web.hub.topics import ReceivedMessage
-    from rmpa.web.monitor.driving import Stick
     from rmpa.web.monitor.monitor import Monitor
 
 _log = logging.getLogger(__name__)

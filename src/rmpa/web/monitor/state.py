@@ -14,19 +14,17 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import msgspec
 
-from rmpa.core.facts import TopicInfo
+from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo, TopicInfo
 from rmpa.core.identity import proxied_node
 from rmpa.discovery.limits import HEARTBEAT_LATE
 from rmpa.web.monitor import limits
 from rmpa.web.monitor.messages import Tree, old_after, without_nulls
-from rmpa.web.monitor.resources import resource_detail, resource_entry, resource_flows
+from rmpa.web.monitor.resources import ResourceFacts, resource_detail, resource_entry, resource_flows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from rmpa.core.facts import LinkInfo, RouteInfo, ServiceInfo
     from rmpa.observe.snapshot import AgentInfo, ModuleFacts, PeerInfo, Snapshot
-    from rmpa.web.monitor.resources import ResourceFacts
 
 _T = TypeVar("_T")
 _SMALL: Final = 0.03

@@ -20,7 +20,7 @@ import msgspec
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.identity import is_type_name, resolve_name
-from rmpa.web.hub.frame_writer import Opcode, size_of
+from rmpa.web.hub.frame_writer import Opcode, OutFrame, size_of
 from rmpa.web.pictures import png_file, png_pixels
 from rmpa.web.rosbridge import limits
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.ros.types.codec import MessageCodec
-    from rmpa.web.hub.frame_writer import OutFrame
 
 
 Id: TypeAlias = str | int | None

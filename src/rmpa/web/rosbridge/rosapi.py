@@ -10,27 +10,23 @@ import base64
 import contextlib
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import urlsplit
 
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.types.codec import codec_for
-from rmpa.ros.types.definitions import parse_definition
+from rmpa.ros.types.definitions import Field, Specification, parse_definition
 from rmpa.ros.types.installed import ServiceType
 from rmpa.ros.types.values import SIZES
-from rmpa.web.hub.graph import GraphService, GraphTopic
+from rmpa.web.hub.graph import GraphService, GraphTopic, GraphWatch
 from rmpa.web.hub.params import MISSING, ros_time
 from rmpa.web.rosbridge import limits
 from rmpa.web.rosbridge.protocol import OpError, graph_name, type_name
 from rmpa.web.rosbridge.tf import SERVICE, SERVICE_TYPE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable
-
-    from rmpa.ros.types.definitions import Field, Specification
     from rmpa.ros.types.messages import MessageType
-    from rmpa.web.hub.graph import GraphWatch
     from rmpa.web.hub.hub import HubClient
     from rmpa.web.hub.node_link import ParamValue
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
 from rmpa.observe import limits as observe_limits
-from rmpa.observe.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.control_client import ControlClient, FoundAgent, choose_agent, find_agents, same_core
 from rmpa.observe.graph import GraphRevision
 from rmpa.runtime.tasks import end_tasks, keep_task
 from rmpa.trust.permissions import TrustStatus
@@ -22,7 +22,6 @@ from rmpa.web.hub.services import SharedTasks
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rmpa.observe.control_client import FoundAgent
     from rmpa.observe.snapshot import Snapshot
     from rmpa.web.hub.graph import GraphWatch
 

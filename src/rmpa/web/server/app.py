@@ -22,7 +22,7 @@ from rmpa.core.errors import StartError
 from rmpa.core.log import RefusalLog
 from rmpa.core.statistics import Counters
 from rmpa.web import api, limits
-from rmpa.web.clients import MONITOR_PATH, is_upgrade
+from rmpa.web.clients import MONITOR_PATH, WebSocketClients, is_upgrade
 from rmpa.web.server.access import (
     TOKEN_PARAMETER,
     AccessPolicy,
@@ -33,8 +33,8 @@ from rmpa.web.server.access import (
     host_name,
     is_loopback,
 )
-from rmpa.web.server.recordings import ROUTE
-from rmpa.web.server.video import PICTURES, VIEWER
+from rmpa.web.server.recordings import ROUTE, RecordingFiles
+from rmpa.web.server.video import PICTURES, VIEWER, VideoStreams
 
 if TYPE_CHECKING:
     import ssl
@@ -43,11 +43,8 @@ if TYPE_CHECKING:
 
     from aiohttp.typedefs import Handler
 
-    from rmpa.web.clients import WebSocketClients
     from rmpa.web.server.access import Place
     from rmpa.web.server.agent_watch import AgentWatch
-    from rmpa.web.server.recordings import RecordingFiles
-    from rmpa.web.server.video import VideoStreams
 
 _log = logging.getLogger(__name__)
 _TYPES: Final = {

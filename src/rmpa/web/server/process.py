@@ -19,8 +19,8 @@ from rmpa.ros.node.node import Node
 from rmpa.runtime.plugins import WEB_PROTOCOLS, load_plugins, plugin_error
 from rmpa.runtime.systemd import feed_watchdog, notify_service_manager
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
-from rmpa.trust.permissions import Permissions, server_names
-from rmpa.trust.store import CERTIFICATE, KEY
+from rmpa.trust.permissions import Permissions, TrustStatus, server_names
+from rmpa.trust.store import CERTIFICATE, KEY, TrustStore
 from rmpa.web import limits
 from rmpa.web.clients import WebSocketClients
 from rmpa.web.hub.connection import Session
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings, WebSettings
     from rmpa.core.contract import Contracts
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
-    from rmpa.trust.permissions import TrustStatus
-    from rmpa.trust.store import TrustStore
 
 _log = logging.getLogger(__name__)
 _DEFAULT_PORT: Final = 8480
