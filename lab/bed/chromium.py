@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from lab.bed.http_client import http_client
-from lab.bed.namespaces import MACHINE
+from lab.bed.namespaces import MACHINE, Host
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import TracebackType
 
-    from lab.bed.namespaces import Host
 
 # The program, or ``None``: then the tests of the pages are skipped.
 BINARY = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

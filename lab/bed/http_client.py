@@ -6,12 +6,10 @@ from typing import TYPE_CHECKING
 
 import aiohttp
 
-from lab.bed.namespaces import MACHINE
+from lab.bed.namespaces import MACHINE, Host
 
 if TYPE_CHECKING:
     import socket
-
-    from lab.bed.namespaces import Host
 
 
 def http_client(host: Host = MACHINE) -> aiohttp.ClientSession:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 
 from lab.bed import namespaces, ros
 from lab.bed.namespaces import Lab
-from lab.bed.system import Classic, Place, Rmpa
+from lab.bed.system import Classic, Place, Rmpa, System
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from lab.bed.plan import Kind, Plan, Transport
-    from lab.bed.system import System
 
 # The nodes of ``nodes/``.
 PROGRAMS = ("source", "velocity", "sink")

@@ -12,7 +12,7 @@ import psutil
 
 from lab.bed import transport
 from lab.bed.agents import Agent, last_link
-from lab.bed.processes import BedError, Closing, Deadline
+from lab.bed.processes import BedError, Closing, Deadline, Process
 from lab.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.core.errors import UnreachableError
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from lab.bed.namespaces import Host, Lab
     from lab.bed.plan import Client, Kind, Transport
-    from lab.bed.processes import Process
     from lab.bed.transport import Pair
     from rmpa.observe.snapshot import Snapshot
 

@@ -11,13 +11,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.processes import DEADLINE, BedError
+from lab.bed.processes import DEADLINE, BedError, Process
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from lab.bed.plan import Transport
-    from lab.bed.processes import Process
 
     # A publisher, and a subscriber of it in another module.
     Pair = tuple[Process, Process]

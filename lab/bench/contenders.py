@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.bench import why_no_hosts, why_no_ros
+from lab.bed.bench import Bed, why_no_hosts, why_no_ros
 from lab.bed.namespaces import MACHINE
 from lab.bed.ros import NODES, Ros, compiled
 from lab.bed.transport import require
@@ -18,7 +18,6 @@ from lab.usage import Meter, Usage
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from lab.bed.bench import Bed
     from lab.bed.plan import Transport
     from lab.bed.processes import Process
 

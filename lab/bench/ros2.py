@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Final
 
 from lab.bed.bench import TEST_NODES, Bed
 from lab.bed.gateways import GatewayProcess, python_of
-from lab.bed.processes import eventually
-from lab.bed.ros import NODES, compiled
+from lab.bed.processes import Process, eventually
+from lab.bed.ros import NODES, Ros, compiled
 from lab.bench.schedule import LatencyScore, MeasuredStream
 from lab.findings import Claim
 from lab.results import finish
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from lab.bed.agents import Agent
-    from lab.bed.processes import Process
-    from lab.bed.ros import Ros
 
 # What ``--only`` can choose.
 PARTS: Final = ("streams", "idle", "start")

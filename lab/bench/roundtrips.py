@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from lab import machine, samples, tables
 from lab.bed.bench import Bed
 from lab.bed.processes import BedError
-from lab.bench.contenders import ENTRIES, SIZES
+from lab.bench.contenders import ENTRIES, SIZES, RoundTripPath
 from lab.bench.schedule import HostLateness
 from lab.findings import Claim
 from lab.results import finish
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from lab.bench.contenders import RoundTripPath
 
 # Round trips of each turn that are thrown away: caches and the processor's clock come up.
 _WARM_UP: Final = 20

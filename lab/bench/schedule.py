@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Final
 import psutil
 
 from lab import machine, samples
-from lab.bed.processes import BedError, Deadline
-from lab.bed.ros import compiled
+from lab.bed.processes import BedError, Deadline, Process
+from lab.bed.ros import Ros, compiled
 from lab.bed.transport import require
 from lab.experiments import flow
 from lab.tables import usage_row
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.plan import Transport
-    from lab.bed.processes import Process
-    from lab.bed.ros import Ros
 
 # Seconds of each round whose messages are thrown away: caches and the processor's clock come up.
 LEAD_IN: Final = 0.2

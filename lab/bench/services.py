@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from lab import samples, tables
 from lab.bed.bench import TEST_NODES, Bed
-from lab.bed.processes import BedError
+from lab.bed.processes import BedError, Process
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import table_of
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.plan import Transport
-    from lab.bed.processes import Process
     from lab.bed.ros import Ros
 
 _SIZES: Final = (64, 64 * 1024, 1024 * 1024)

@@ -16,7 +16,7 @@ from lab.results import finish
 from lab.tables import dash, ratio, table_of
 from lab.web import page
 from lab.web.messages import Load, Way, stall
-from lab.web.servers import start_rmpa, start_sdk, why_no_sdk
+from lab.web.servers import WebServer, start_rmpa, start_sdk, why_no_sdk
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from lab.web.servers import WebServer
 
 # What ``--only`` can choose.
 PARTS: Final = ("messages", "slow", "page")

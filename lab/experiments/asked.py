@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.plan import Plan
+from lab.bed.plan import Client, Plan, Size
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from lab.bed.plan import Client, Size
     from lab.experiments.model import Cell
 
 

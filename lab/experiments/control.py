@@ -27,7 +27,7 @@ from lab.experiments.contenders import (
     transport_of,
     turn,
 )
-from lab.experiments.model import Cell, Measured
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from, pairs, source_periods
 from lab.words import counted
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from lab.bed.stage import Stage
     from lab.bed.system import System
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Results, Value
 
 # Hz, of commands and of the polling velocity node; the paper's.
 RATE: Final = 10.0

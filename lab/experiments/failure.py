@@ -14,21 +14,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from lab.bed import transport
-from lab.bed.processes import Deadline, eventually
+from lab.bed.processes import Deadline, Process, eventually
 from lab.experiments import flow
 from lab.experiments.contenders import COMPARED, system_of, transport_of
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, findings
-from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from lab.bed.plan import Client, Plan
-    from lab.bed.processes import Process
     from lab.bed.stage import Stage
     from lab.bed.system import System
-    from lab.experiments.model import Value
     from lab.findings import Findings
 
 HOSTS: Final = ("joystick", "velocity", "base", "pc")

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.experiments.contenders import COMPARED, DIRECT, RMPA, contender_of
+from lab.experiments.contenders import COMPARED, DIRECT, RMPA, Contender, contender_of
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.statistics import flowing, outages
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from lab.experiments.contenders import Contender
     from lab.experiments.model import Cell, Measured, Results
 
 # Messages a second of each source.

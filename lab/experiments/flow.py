@@ -22,13 +22,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pandas as pd
 
-from lab.bed.processes import DEADLINE, BedError, Deadline
+from lab.bed.processes import DEADLINE, BedError, Deadline, Process
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lab.bed.processes import Process
 
 # Bytes at the least of a measured message.
 HEAD: Final = 16

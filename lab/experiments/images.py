@@ -12,7 +12,7 @@ import pandas as pd
 from lab import frames
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, COMPARED, MIXED, RMPA, contender_of, system_of, transport_of, turn
-from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.experiments.payload import bits_per_second
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from lab.bed.stage import Stage
     from lab.bed.system import System
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Value
 
 HOSTS: Final = ("joystick", "pc")
 # Where the plan has none: the experiment is about a cable that is full.

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, statistics, words
-from lab.experiments.contenders import CLASSIC, COMPARED, DIRECT, RMPA, contender_of, turn
-from lab.experiments.model import Cell
+from lab.experiments.contenders import CLASSIC, COMPARED, DIRECT, RMPA, Contender, contender_of, turn
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.stream import LEAD, SETTLE, stream
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import latencies, lost
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from lab.bed.plan import Plan
     from lab.bed.stage import Stage
-    from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Results
 
 _KB: Final = 1024
 # Bytes: 1 KB to 1 MB, doubling; a few of them to see that it works.

@@ -20,7 +20,7 @@ from lab.experiments.contenders import (
     relays_of,
     turn,
 )
-from lab.experiments.model import Cell
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.stream import SETTLE, stream
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import latencies, lost
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from lab.bed.plan import Plan
     from lab.bed.stage import Stage
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Results
 
 # Hz; the paper's.
 PAPER: Final = (10, 20, 30, 40, 50)

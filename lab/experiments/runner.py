@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from lab import machine
-from lab.experiments.model import Measured
-from lab.experiments.store import utc
+from lab.experiments.model import Cell, Experiment, Measured
+from lab.experiments.store import Store, utc
 from lab.frames import frame
 from rmpa.core.errors import RmpaError
 
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
     from lab.bed.plan import Plan
     from lab.bed.stage import Stage
-    from lab.experiments.model import Cell, Experiment
     from lab.experiments.progress import Progress
-    from lab.experiments.store import Store
 
 # Each cell's table of how late the machine's own wake-ups came: ``when`` (before, after the cell), ``late_us``.
 LATENESS: Final = "lateness"

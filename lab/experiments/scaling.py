@@ -7,10 +7,10 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.processes import Deadline
+from lab.bed.processes import Deadline, Process
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, COMPARED, DIRECT, RMPA, contender_of, system_of, transport_of
-from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from, frame, latencies, lost
 from lab.samples import summary
@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from lab.bed.plan import Client, Plan
-    from lab.bed.processes import Process
     from lab.bed.stage import Stage
     from lab.bed.system import System
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Value
 
 # The module that sends; with classic ROS it has the master.
 FIRST: Final = "pc"

@@ -9,7 +9,7 @@ import pandas as pd
 
 from lab.experiments import flow
 from lab.experiments.contenders import nodelay_of, relays_of, system_of, transport_of
-from lab.experiments.model import Measured
+from lab.experiments.model import Cell, Measured, Value
 from lab.frames import counting_from
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from lab.bed.plan import Client
     from lab.bed.processes import Process
     from lab.bed.stage import Stage
-    from lab.experiments.model import Cell, Value
 
 HOSTS: Final = ("joystick", "pc")
 TOPIC: Final = "/cmd"

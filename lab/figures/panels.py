@@ -8,7 +8,7 @@ import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from lab.figures.colours import shade
+from lab.figures.colours import Look, shade
 from lab.samples import percentile, summary
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.ticker import Locator
 
-    from lab.figures.colours import Look
     from lab.findings import Panel, Series
 
 # Characters of all groups' names that have room beside each other in a panel.

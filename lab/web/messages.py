@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from lab.bed.processes import BedError
-from lab.usage import Meter
+from lab.bed.processes import BedError, Process
+from lab.usage import Meter, Usage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from lab.bed.processes import Process
-    from lab.usage import Usage
     from lab.web.servers import WebServer
     from lab.web.subscriptions import How
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from lab.bed.chromium import BINARY, Chromium, PageError
-from lab.bed.processes import BedError
+from lab.bed.processes import BedError, Process
 from lab.usage import Meter
 from lab.web.servers import program, rmpa_web
 from lab.web.websocket import WebSocket
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
-    from lab.bed.processes import Process
 
 MODULE: Final = "pc"
 # Seconds after the first state: the hub has read the graph, and rates are smooth.

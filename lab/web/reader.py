@@ -12,15 +12,12 @@ import argparse
 import statistics
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from lab.bed.processes import BedError
 from lab.nodes.node import commands, say
-from lab.web.subscriptions import HOWS, head_of, protocol_of, subscribe
+from lab.web.subscriptions import HOWS, How, head_of, protocol_of, subscribe
 from lab.web.websocket import WebSocket
-
-if TYPE_CHECKING:
-    from lab.web.subscriptions import How
 
 # Seconds between looks whether nothing comes any more.
 _LOOK: Final = 0.05

@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from lab.bed.agents import RMPA
+from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import Process
-from lab.bed.ros import NODES, free_port
+from lab.bed.ros import NODES, Ros, free_port
 
 if TYPE_CHECKING:
-    from lab.bed.agents import Agent
     from lab.bed.bench import Bed
-    from lab.bed.ros import Ros
     from lab.web.subscriptions import How
 
 _ROOT: Final = Path(__file__).parents[2]

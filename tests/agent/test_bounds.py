@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits as bridge_limits
-from rmpa.config.settings import LimitSettings
+from rmpa.config.settings import LimitSettings, Settings
 from rmpa.ros import limits as ros_limits
 from tests.agent.test_agent import node, running, until
 from tests.agent.test_diagnostics import Statuses
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import pytest
 
     from rmpa.agent.agent import Agent
-    from rmpa.config.settings import Settings
     from rmpa.core.facts import BoundInfo
     from rmpa.observe.snapshot import Snapshot
     from rmpa.observe.why.diagnosis import Diagnosis

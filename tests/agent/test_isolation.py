@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -43,7 +43,6 @@ from rmpa.runtime import loop as loop_module
 from rmpa.runtime.loop import AgentLoop, DirectSelector, yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Iterator
     from pathlib import Path
     from types import FrameType
 

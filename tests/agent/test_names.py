@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.peer_rules import PeerRule
-from rmpa.config.settings import TimeSettings
+from rmpa.config.settings import Settings, TimeSettings
 from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.config.settings import Settings
     from rmpa.core.facts import TopicInfo
 
 PREFIX = (PeerRule("robot", "/{peer}"),)

@@ -15,7 +15,7 @@ import pytest
 
 from rmpa.agent import agent
 from rmpa.agent import agent as core_choice
-from rmpa.agent.agent import JOIN_RETRY, Network, is_displaced
+from rmpa.agent.agent import JOIN_RETRY, Agent, Network, is_displaced
 from rmpa.bridge import limits
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config.peer_rules import PeerRule
@@ -35,7 +35,6 @@ from tests.bridge.io.virtual import VirtualLoop, run
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.agent.agent import Agent
     from rmpa.observe.why.diagnosis import Diagnosis
     from rmpa.ros.node.endpoints import Publisher
 

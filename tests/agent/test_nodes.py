@@ -12,7 +12,7 @@ import pytest
 
 from rmpa.bridge.nodes import NODES, Nodes
 from rmpa.config.peer_rules import PeerRule, PolicySettings
-from rmpa.config.settings import NodeSettings
+from rmpa.config.settings import NodeSettings, Settings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeFacts, NodePing, PeerNodes
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent.agent import Agent
-    from rmpa.config.settings import Settings
 
 
 async def ask(agent: Agent, kind: Any, what: str, name: str = "", peer: str | None = "b") -> Any:

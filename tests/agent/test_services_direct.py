@@ -10,7 +10,7 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.bridge.direct.paths import Condition
 from rmpa.bridge.policy import Needs
-from rmpa.config.settings import ServiceSettings
+from rmpa.config.settings import ServiceSettings, Settings
 from rmpa.core.contract import Transport
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceEndpoint
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from rmpa.agent.agent import Agent
     from rmpa.bridge.sessions import PeerSession
-    from rmpa.config.settings import Settings
     from rmpa.core.facts import ServiceInfo
 
 CLIENT = "/client"

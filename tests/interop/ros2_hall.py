@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
 from lab.bed.gateways import ROUTER_PORT, GatewayProcess, python_of
-from lab.bed.namespaces import Lab
+from lab.bed.namespaces import Host, Lab
 from lab.bed.processes import Event, Process
 from lab.bed.ros import NODES as LAB_NODES
 from tests.interop.modules import Module
@@ -20,7 +20,6 @@ from tests.interop.ros import NODES, Ros
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from lab.bed.namespaces import Host
 
 LONG: Final = 30.0
 CONFIG: Final = f"""

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.gateways import python_of
-from lab.bed.processes import eventually
-from tests.interop.modules import flows
+from lab.bed.processes import Process, eventually
+from tests.interop.modules import Module, flows
 from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.bed.processes import Process
-    from tests.interop.modules import Module
 
 pytestmark = [
     pytest.mark.ros,

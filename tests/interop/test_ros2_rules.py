@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.gateways import python_of
-from lab.bed.processes import eventually
+from lab.bed.processes import Process, eventually
 from tests.interop.ros2_hall import LONG, Hall, OtherEnd, running_hall
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from lab.bed.processes import Process
 
 pytestmark = [
     pytest.mark.ros,

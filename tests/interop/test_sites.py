@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from lab.bed.agents import RMPA
+from lab.bed.agents import RMPA, Agent
 from lab.bed.processes import Process, eventually
 from tests.interop.modules import flows, whole
 from tests.interop.recordings import recorded
@@ -23,7 +23,6 @@ from tests.interop.sites import JoinedModules, ended, joined_modules, nodes
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.bed.agents import Agent
 
 pytest.importorskip("zenoh", reason="the extra rmpa[zenoh] is not installed")
 pytestmark = [pytest.mark.ros, pytest.mark.nat, pytest.mark.timeout(120)]

@@ -13,7 +13,7 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from lab.bed.agents import RMPA
+from lab.bed.agents import RMPA, Agent
 from lab.bed.chromium import Chromium
 from lab.bed.processes import Process, eventually
 from rmpa.trust import store as files_of
@@ -24,7 +24,6 @@ from tests.interop.web import needs_browser
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.bed.agents import Agent
     from lab.bed.namespaces import Lab
     from rmpa.observe.snapshot import PeerInfo
     from rmpa.trust.store import TrustStore

@@ -29,7 +29,7 @@ from lab.bed import ros
 from lab.bed.agents import Agent
 from lab.bed.chromium import Chromium
 from lab.bed.http_client import http_client
-from lab.bed.namespaces import MACHINE
+from lab.bed.namespaces import MACHINE, Host, Lab
 from lab.bed.processes import DEADLINE, Process
 from lab.bed.ros import free_port
 from rmpa.ros.environment import RosEnvironment
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
-    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, WebFactory
 
 RUN: Final = 120.0

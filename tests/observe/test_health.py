@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
@@ -10,11 +10,8 @@ import pytest
 from rmpa.core.facts import EventInfo, FilesInfo, RouteInfo, ServiceInfo, UnreachableInfo
 from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health, diagnostic_status
-from rmpa.observe.snapshot import Snapshot
+from rmpa.observe.snapshot import PeerInfo, Snapshot
 from tests.observe.samples import DIRECT, SNAPSHOT, VIEWER
-
-if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo
 
 JOYSTICK, _ = SNAPSHOT.peers
 assert JOYSTICK.link is not None

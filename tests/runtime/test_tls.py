@@ -6,7 +6,6 @@ import asyncio
 import random
 import socket
 import ssl
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -19,9 +18,6 @@ from tests.runtime.message_streams import End
 from tests.runtime.secure_pairs import SecurePairs, make_context
 from tests.trust.authority import Authority
 from tests.waiting import until
-
-if TYPE_CHECKING:
-    from tests.runtime.secure_pairs import SecurePairs
 
 pytest.importorskip("cryptography")
 

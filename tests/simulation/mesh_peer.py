@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 from rmpa.config.settings import LaneSettings
 from rmpa.core.statistics import Counters
 from rmpa.mesh.io.lane import Dialler
-from rmpa.mesh.io.link import LinkHandlers
+from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.mesh import Mesh
 from tests.simulation.process import Process
 from tests.simulation.roster_peer import RosterPeer
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from rmpa.discovery.membership import PeerEvent
     from rmpa.mesh.frames import Lane
-    from rmpa.mesh.io.link import PeerLink
     from tests.simulation.network import Address
 
 

@@ -7,13 +7,12 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.agents import Agent
-from tests.soak.stage import LISTENERS, STEADY, TALKERS
+from tests.soak.stage import LISTENERS, STEADY, TALKERS, Stage
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
-    from tests.soak.stage import Stage
 
 Disturbance = tuple[str, "Callable[[], list[str]]"]
 """Its description, and the function that does it and returns what went wrong."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lab.experiments.registry import find_experiment
-from lab.findings import Findings
+from lab.findings import Figure, Findings
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from lab.experiments.model import Experiment, Results, Value
     from lab.experiments.store import Store
-    from lab.findings import Figure
 
 _log = logging.getLogger(__name__)
 

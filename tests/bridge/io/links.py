@@ -7,18 +7,16 @@ import math
 from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core import limits as core_limits
-from rmpa.core.outbox import FIRST, LAST, URGENT, Outbox
+from rmpa.core.outbox import FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.io.lane import LaneSender
-from rmpa.mesh.io.link import CONNECTION_URGENT_BYTES
+from rmpa.mesh.io.link import CONNECTION_URGENT_BYTES, PeerLink
 from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.core.outbox import Framer, QueuedMessage
     from rmpa.mesh.connection import DataHandler
-    from rmpa.mesh.io.link import PeerLink
     from tests.bridge.io.two_bridges import Side
 
 

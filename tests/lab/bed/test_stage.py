@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from lab.bed.plan import Kind, Plan
-from lab.bed.processes import run
-from lab.bed.stage import make_stage
+from lab.bed.plan import Client, Kind, Plan
+from lab.bed.processes import Process, run
+from lab.bed.stage import Stage, make_stage
 from lab.experiments import flow
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.bed.plan import Client
-    from lab.bed.processes import Process
-    from lab.bed.stage import Stage
     from lab.bed.system import System
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.ros, pytest.mark.netns]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from lab.bed.plan import Plan
 from lab.experiments.code import Code
-from lab.experiments.model import Cell, Measured
+from lab.experiments.model import Cell, Measured, Results
 from lab.findings import Claim, Findings
 from lab.frames import frame
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from lab.bed.stage import Stage
-    from lab.experiments.model import Results
 
 PLAN = Plan(size="short", link="")
 CODE = Code(version="1.0", digest="0123456789ab", commit="abc1234")

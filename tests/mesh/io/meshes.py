@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rmpa.core.identity import Guid, Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import Frame, FrameKind, Hello, Lane
-from rmpa.mesh.io.link import LinkHandlers
+from rmpa.mesh.io.link import LinkHandlers, PeerLink
 from rmpa.mesh.io.mesh import Mesh
 from tests.mesh.worlds import AnyRoute
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.config.settings import LaneSettings
-    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.securing import OnJoin
     from rmpa.trust.membership import Membership
 

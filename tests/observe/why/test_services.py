@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import pytest
 
 from rmpa.core.facts import BoundInfo, FilesInfo, LaneInfo, ServiceInfo
 from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.snapshot import ModuleFacts
+from rmpa.observe.snapshot import ModuleFacts, PeerInfo
 from rmpa.observe.why.diagnosis import Diagnosis, ServiceAtServer
 from rmpa.observe.why.services import ServiceHere, diagnose_module, diagnose_service
 from tests.observe.samples import SNAPSHOT
 from tests.observe.why.test_topics import LINK, PEER, unlinked
-
-if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo
 
 BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
 THERE = ServiceAtServer(node="/arm", service="/move", rule="services.allow has '/**'")

@@ -14,20 +14,17 @@ import random
 import sys
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import psutil
 
 from lab.bed.bench import Bed
 from lab.bed.chromium import BINARY, Chromium, PageError
-from lab.bed.processes import BedError
+from lab.bed.processes import BedError, Process
 from lab.web.page import served_mesh
 from rmpa.core.errors import RmpaError
 from tests.soak.held import MB, growth, too_much
 from tests.soak.web.churn import MESH_EVERY, Clients, Topics, Views
-
-if TYPE_CHECKING:
-    from lab.bed.processes import Process
 
 _SAMPLES: Final = 60
 _SAMPLE_EVERY: Final = 15.0

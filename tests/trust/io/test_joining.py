@@ -40,7 +40,7 @@ from rmpa.trust.membership import (
 )
 from rmpa.trust.permissions import TrustError
 from rmpa.trust.store import ALPN_JOIN, MemberFiles, TrustStore, join_context, member_context
-from rmpa.trust.tokens import CertificateGrant, Invitation, Join, JoinRefused, Renew, encode_message, proof_of
+from rmpa.trust.tokens import CertificateGrant, Invitation, Join, JoinRefused, Renew, Token, encode_message, proof_of
 from tests.trust.authority import WALL
 from tests.trust.io.member_files import HandClock
 
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from rmpa.trust.tokens import Token
 
 DEADLINE = 30.0
 DAY = 86_400.0

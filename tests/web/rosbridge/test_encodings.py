@@ -20,7 +20,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.messages import MessageType
 from rmpa.web import limits as web_limits
-from rmpa.web.hub.frame_writer import Opcode
+from rmpa.web.hub.frame_writer import Opcode, OutFrame
 from rmpa.web.hub.topics import MadeOnce
 from rmpa.web.pictures import png_chunk
 from rmpa.web.rosbridge import limits
@@ -39,7 +39,6 @@ from rmpa.web.rosbridge.protocol import (
 if TYPE_CHECKING:
     import random
 
-    from rmpa.web.hub.frame_writer import OutFrame
 
 pillow = pytest.importorskip("PIL.Image", reason="pillow, which checks pictures, comes with the extra lab")
 STRING = codec_for(MessageType("std_msgs/String"))
