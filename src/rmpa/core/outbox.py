@@ -208,7 +208,7 @@ class Outbox:
             self._committed.appendleft(memoryview(data))
             self._committed_bytes += len(data)
 
-    def push(self, data: bytes | bytearray, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
+    def push(self, data: bytes | bytearray | memoryview, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
         """Queue one whole entry; return how many older entries, of any key, were dropped to make room.
 
         An empty entry is not queued. A pinned entry (a mark between messages) is never dropped and does not count

@@ -249,7 +249,7 @@ class Stream:
         except BlockingIOError:
             pass
         except OSError as error:
-            self._lost(error)
+            self.lost(error)
         self.bytes_out += sent
         return sent
 
@@ -456,7 +456,8 @@ class Stream:
         if self._drained is not None and not self._drained.done():
             self._drained.set_result(None)
 
-    def _lost(self, error: Exception | None) -> None:
+    def lost(self, error: Exception | None) -> None:
+        """End the connection as at an error of its own, which ``on_close`` gets; ``None``: the other side has ended."""
         if not self.closed:
             on_close = self._on_close
             self._shut()
@@ -482,10 +483,10 @@ class Stream:
         except BlockingIOError:
             return
         except OSError as error:
-            self._lost(error)
+            self.lost(error)
             return
         if count == 0:
-            self._lost(None)
+            self.lost(None)
             return
         self._heard()
         if count == INCOMPLETE:  # a large record on a slow network is no silence
@@ -528,7 +529,7 @@ class Stream:
         except Exception as error:  # noqa: BLE001 - a callback's top: else the same bytes would be offered for ever
             if not isinstance(error, RemoteProtocolError):
                 _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
-            self._lost(error)
+            self.lost(error)
             return
         if self.closed:
             return
@@ -564,7 +565,7 @@ class Stream:
             except BlockingIOError:
                 return
             except OSError as error:
-                self._lost(error)
+                self.lost(error)
                 return
             self.bytes_out += sent
             self.outbox.consumed(sent)

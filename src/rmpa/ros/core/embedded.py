@@ -238,6 +238,8 @@ class RosCore(Core):
         self._rosout = Rosout(self, host, self._advertised) if rosout else None
         # Topics and slave APIs of withdrawn publishers, and when.
         self._withdrawn: dict[tuple[str, str], float] = {}
+        # Topics whose lists will be repeated.
+        self._repeated = set[str]()
         self.on_change(self._publisher_changed)
         self.stored: CoreState | None = None
         if state is not None:
@@ -356,10 +358,12 @@ class RosCore(Core):
             self._withdrawn[key] = loop.time()
             if len(self._withdrawn) > WITHDRAWN_KEPT:
                 del self._withdrawn[next(iter(self._withdrawn))]
-        elif at is not None and loop.time() - at <= WITHDRAWN_LATELY:
+        elif at is not None and loop.time() - at <= WITHDRAWN_LATELY and change.name not in self._repeated:
+            self._repeated.add(change.name)
             loop.call_later(PUBLISHERS_AGAIN, self._repeat_publishers, change.name)
 
     def _repeat_publishers(self, topic: str) -> None:
+        self._repeated.discard(topic)
         self.registrations.notify_subscribers(topic)
         self._carry_out()
 

@@ -15,6 +15,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import OutOfDescriptors, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.limits import KIB
 from rmpa.ros import limits
 from rmpa.ros.environment import NodeConnection, NodePing
 from rmpa.ros.http.rpc import call, call_api, connect, split_uri
@@ -58,12 +59,13 @@ async def exchange_headers(sock: socket.socket, header: tcpros.Header) -> tcpros
 
 async def read_header(sock: socket.socket) -> tcpros.Header | None:
     """The connection header that comes, or ``None`` if the other side closes before; errors as above."""
-    loop, data = asyncio.get_running_loop(), b""
+    loop, data = asyncio.get_running_loop(), bytearray()
     while True:
         fields, _, wanted = tcpros.parse_header(data)
         if fields is not None:
             return fields
-        chunk = await loop.sock_recv(sock, wanted - len(data))  # what follows the header is left to the caller
+        # What follows the header is left to the caller. A part at a time: the other side may send few bytes of many.
+        chunk = await loop.sock_recv(sock, min(wanted - len(data), 64 * KIB))
         if not chunk:
             return None
         data += chunk

@@ -26,6 +26,7 @@ from rmpa.ros.types.codec import codec_for
 from rmpa.ros.types.find import type_of_header
 from rmpa.ros.types.messages import HeaderNumbers, MessageType, Plain, given_values
 from rmpa.ros.wire.tcpros import ANY, LENGTH, Buffer, TopicDescription, frame_message, printable
+from rmpa.ros.wire.xmlrpc import RosFault
 from rmpa.runtime.tasks import OwnedTasks
 
 if TYPE_CHECKING:
@@ -158,7 +159,12 @@ class MasterClient:
         try:
             async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT):
                 if calls:
-                    await call(self.master_uri, "system.multicall", calls)
+                    try:
+                        await call(self.master_uri, "system.multicall", calls)
+                    except RosFault:  # a master that lacks it
+                        each = [(f"unregister{entry.kind_name}", entry.key, entry.uri) for entry in self._entries]
+                        each += [("unsubscribeParam", self.uri, key) for key in self._followed]
+                        await asyncio.gather(*(self.call_master(*one) for one in each), return_exceptions=True)
                 await asyncio.gather(*self._unregistering)
         except (RmpaError, TimeoutError) as error:
             _log.debug("! %s: not everything is unregistered at %s: %s", self.name, self.master_uri, error)

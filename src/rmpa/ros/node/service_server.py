@@ -30,6 +30,8 @@ SERVICE_STALL: Final = 30.0
 BODIES: Final = 0
 # Larger bodies wait where they are: to copy 64 MiB into a queue would hold up the event loop for 30 ms.
 _INLINE: Final = 256 * KIB
+# They are queued in parts, since one call of the kernel may take a whole entry: 64 MiB are 15 ms.
+_PART: Final = 64 * KIB
 
 
 def send_body(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
@@ -40,7 +42,9 @@ def send_body(stream: Stream, head: bytes, body: tcpros.Buffer) -> None:
         stream.pump()  # what is collected goes first
         stream.outbox.push(head, BODIES, pinned=True)
         # A view may be valid during this call only.
-        stream.outbox.push(bytes(body) if isinstance(body, memoryview) else body, BODIES, pinned=True)
+        view = memoryview(bytes(body) if isinstance(body, memoryview) else body)
+        for start in range(0, len(view), _PART):
+            stream.outbox.push(view[start : start + _PART], BODIES, pinned=True)
         stream.pump()
 
 

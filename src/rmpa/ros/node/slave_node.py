@@ -277,7 +277,11 @@ class SlaveNode:
             if connection is None:
                 sock.close()
         if connection is not None:
-            self._attach(connection)
+            try:
+                self._attach(connection)
+            except Exception as error:
+                connection.lost(error)  # else the other side would wait for ever
+                raise
 
     def _attach(self, connection: AcceptedConnection) -> None:
         fields = connection.request
