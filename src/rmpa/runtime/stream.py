@@ -457,7 +457,7 @@ class Stream:
             self._drained.set_result(None)
 
     def lost(self, error: Exception | None) -> None:
-        """End the connection as at an error of its own, which ``on_close`` gets; ``None``: the other side has ended."""
+        """End the connection as at an error of its own, which ``on_close`` gets; ``None``: the other side ended."""
         if not self.closed:
             on_close = self._on_close
             self._shut()
