@@ -42,8 +42,8 @@ _log = logging.getLogger(__name__)
 CHILD_RESTART_FIRST: Final = 0.5
 # The longest such time.
 CHILD_RESTART_CAP: Final = 30.0
-# For them to end when the agent ends; then they are killed.
-CHILD_END: Final = 5.0
+# For them to end after SIGINT when the agent ends; SIGTERM and SIGKILL follow.
+CHILD_END: Final = 2.0
 
 
 # Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``).

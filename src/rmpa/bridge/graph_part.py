@@ -217,7 +217,8 @@ class GraphPart(Part, ImportEffects):
             for change in self.imports.changes(session.peer, message):
                 if session.link is not link or not session.linked:
                     return
-                self.imports.take_in(session.peer, *change, self.now())
+                with logged_failure(_log, "an offer of %s failed; the others are taken", session.link.name):
+                    self.imports.take_in(session.peer, *change, self.now())
                 yield
 
     @abstractmethod

@@ -138,7 +138,9 @@ class Launcher(Part):
             return
         for name, note in notes.items():
             one = self._of(name, self._folder / note.made_of[0])
-            if not one.runs:
+            if not note.mark.runs and one.mark is None:
+                one.mark, one.restarts = note.mark, note.restarts  # its nodes may still run
+            elif note.mark.runs and not one.runs:
                 one.adopt(note)
 
     def _of(self, name: str, path: Path) -> ResourceProgram:
@@ -340,6 +342,6 @@ class Launcher(Part):
 
 
 def _load_notes(state: Path) -> dict[str, ProgramNote]:
-    """The notes of the programs that run, by the names of their resources; reads the disk."""
+    """The notes of the programs that an agent before has started, by the names of their resources; reads the disk."""
     notes = {path.name[1:-5]: ProgramNote.load(path) for path in (state / RUNS).glob(".*.json")}
-    return {name: note for name, note in notes.items() if note is not None and note.mark.runs}
+    return {name: note for name, note in notes.items() if note is not None}

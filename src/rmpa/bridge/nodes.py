@@ -404,7 +404,7 @@ class ProxyKills:
         session = next((one for one in linked if proxy.startswith(f"{one.proxies.prefix}/")), None)
         if session is None:
             module, node = proxied_node(proxy) or ("", proxy)
-            return RosReply(_REFUSED, f"{node} is a node of {module}, to which there is no link: ask there", 0)
+            return RosReply(_REFUSED, f"{node} is a node of {module}, which is no linked peer: end it there", 0)
         node = proxy.removeprefix(session.proxies.prefix)
         whose = f"{session.link.name}:{node}"
         if caller == MASTER_ID:

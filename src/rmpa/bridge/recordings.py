@@ -21,7 +21,7 @@ import msgspec
 from rmpa.bridge import limits
 from rmpa.bridge.kept import KEPT, Kept, check_id, find_kept, read_kept, recording_id, remove_kept, request_keep
 from rmpa.bridge.policy import Needs
-from rmpa.bridge.rpc import gate_for, meant
+from rmpa.bridge.rpc import EARLIER, gate_for, meant
 from rmpa.bridge.sessions import Part, PeerSession
 from rmpa.config.module_name import module_dir, state_dir
 from rmpa.config.peer_rules import Access
@@ -153,7 +153,7 @@ class Recordings(Part):
             why = await self._bridge.rpc.request(session, KEEP, {"kept": msgspec.to_builtins(kept), "now": now})
         except PeerRefused as error:
             done.add(session.link.name)
-            return error.reason
+            return EARLIER if error.unknown else error.reason
         except RmpaError as error:
             return str(error)
         done.add(session.link.name)

@@ -55,7 +55,7 @@ Listener = Callable[["PeerSession", dict[str, Any]], None]
 
 
 # Of an agent that does not know a question that a later release asks.
-_EARLIER: Final = "its agent is of an earlier release, which does not know this; install this release there"
+EARLIER: Final = "its agent is of an earlier release, which does not know this; install this release there"
 
 
 _Answer = TypeVar("_Answer", bound=ModuleAnswer)
@@ -137,7 +137,7 @@ class PeerRpc(Part):
         except msgspec.ValidationError as error:
             problem, code = f"its answer is malformed: {error}", "protocol-error"
         except PeerRefused as error:
-            problem, code = (_EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
+            problem, code = (EARLIER, "other-release") if error.unknown else (error.reason, "not-permitted")
         except RmpaError as error:
             problem, code = str(error), error.code
         return answer(module=session.link.name, problem=problem, code=code)

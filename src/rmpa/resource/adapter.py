@@ -242,7 +242,7 @@ class Adapter(RuntimePart):
 
     def _judge_alarms(self) -> None:
         """Raise the alarms whose rules are true now, and clear others; one whose rule is unknown stays as it is."""
-        values = self._values.now()
+        values = self._values.now() if self._runtime.resource.alarms else {}
         for alarm in self._runtime.resource.alarms.values():
             holds, stands = alarm.when.holds(values), alarm.name in self._standing
             if holds is None or holds == stands:

@@ -214,16 +214,22 @@ class Demands(RuntimePart):
         self._undo = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
-        """Send the requests."""
-        for demand in self._runtime.resource.demands.values():
-            client = await self._undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
-            self._clients[demand.resource] = client
-            self._runtime.bind(demand, "on_change", self._request)
-            self._work.add(keep_task(functools.partial(self._follow, demand, client), f"follow {demand.resource}"))
-            if demand.requests:
-                self._request(demand)
-            if self._runtime.resource.inputs:
-                await self._observe(demand.resource, client)
+        """Send the requests; one that fails leaves nothing behind."""
+        try:
+            for demand in self._runtime.resource.demands.values():
+                client = await self._undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
+                self._clients[demand.resource] = client
+                self._runtime.bind(demand, "on_change", self._request)
+                self._work.add(
+                    keep_task(functools.partial(self._follow, demand, client), f"follow {demand.resource}")
+                )
+                if demand.requests:
+                    self._request(demand)
+                if self._runtime.resource.inputs:
+                    await self._observe(demand.resource, client)
+        except BaseException:
+            await self.close()
+            raise
 
     async def close(self) -> None:
         """Release all requirements."""

@@ -26,7 +26,7 @@ import operator
 import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rmpa.config.values import did_you_mean, suggestion
@@ -99,7 +99,7 @@ class Expression:
     text: str
     value: _Value
     references: tuple[str, ...]
-    sources: Mapping[str, SourceCall]
+    sources: Mapping[str, SourceCall] = field(hash=False)
 
     def __str__(self) -> str:
         """The text."""

@@ -347,7 +347,8 @@ class Measuring(RuntimePart):
     async def start(self) -> None:
         """Begin to measure: by subscribing, or by asking for counters."""
         self._loop = asyncio.get_running_loop()
-        self.quality.restart(self._loop.time())
+        # Anew: the types of outputs are learnt by now.
+        self.quality = QualityMeasurement(self._runtime.resource, self._loop.time())
         self._runtime.listeners.append(self._heard)
         for declared in self._runtime.resource.declared_attributes.values():
             self._runtime.bind(declared, "on_observation", self.quality.observe)

@@ -422,6 +422,13 @@ class Resource:
         made.check(where)
         if any(other.name == made.name for other in self.nodes.values()) or made.name == f"/{self.name}":
             raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
+        for (kind, owner, _), rule in self.expressions() if len(self.nodes) == 1 else ():
+            if any(
+                one.function in ("cpu", "memory", "running") and not one.arguments for one in rule.sources.values()
+            ):
+                raise ConfigError(
+                    where, f"{kind} {owner} has a rule that names no node: {rule}", "name the node there"
+                )
         self.nodes[key] = made
         return made
 

@@ -77,12 +77,12 @@ class ExpressionValues(RuntimePart):
     async def start(self) -> None:
         """Look for the topics that the expressions name, and read what their functions answer."""
         used = {source.function for source in self._sources.values()}
+        if "diagnostics" in used:
+            await self._runtime.node.subscribe("/diagnostics", MessageType(ARRAY_TYPE), self._diagnosed)
         if self._fields:
             self._work.start(self._find_topics(), "find topics of expressions")
         if used & _FIGURES:
             self._work.add(keep_task(self._read_figures, f"figures for {self._runtime.resource.name}"))
-        if "diagnostics" in used:
-            await self._runtime.node.subscribe("/diagnostics", MessageType(ARRAY_TYPE), self._diagnosed)
 
     def problems(self) -> tuple[list[str], list[str]]:
         """Why fields that expressions refer to cannot be read."""
@@ -90,8 +90,9 @@ class ExpressionValues(RuntimePart):
 
     def blocked(self) -> dict[str, str]:
         """The profiles whose rule is false; an unknown rule blocks none."""
-        values, profiles = self.now(), self._runtime.resource.profiles.values()
+        profiles = self._runtime.resource.profiles.values()
         rules = {one.name: one.rule for one in profiles if one.rule is not None}
+        values = self.now() if rules else {}
         return {
             name: f"its rule does not hold: {rule}" for name, rule in rules.items() if rule.holds(values) is False
         }
@@ -211,7 +212,8 @@ class ExpressionValues(RuntimePart):
             pids = {key: pid for key in self._runtime.resource.nodes if (pid := self._processes.pid(key)) is not None}
             found = {key: one for key, pid in pids.items() if (one := figures(pid)) is not None}
             self._memory = {key: float(one.rss) for key, one in found.items()}
-            self._cpu = {key: shares.of(pids[key], one) for key, one in found.items()}
+            told = [(key, shares.known(pids[key]), shares.of(pids[key], one)) for key, one in found.items()]
+            self._cpu = {key: share for key, known, share in told if known}  # the first is since the node began
             shares.keep(set(pids.values()))
             if zones:
                 self._zones = await in_thread(read_zones, "thermal zones")

@@ -69,7 +69,7 @@ class Site:
     def imported(self, name: str) -> ImportedTopic:
         """A topic that comes in."""
         (entry,) = (each for each in self.neighbour.imports.entries if each.source.name == name)
-        topic = self.neighbour.imported[entry.source]
+        topic = self.neighbour.imported[entry.source, entry.announced.name]
         assert isinstance(topic, ImportedTopic)
         return topic
 

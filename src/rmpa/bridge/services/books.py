@@ -241,6 +241,8 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
         self._local: dict[str, str] = {}
         self._claims: dict[str, dict[RemoteService, None]] = {}
         self._shown: dict[str, RemoteService] = {}
+        # Those whose peers have not answered yet.
+        self._opening = set[RemoteService]()
 
     def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
         """The number of the peer and the service, for each service of each peer."""
@@ -412,6 +414,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             timeout = self._out.context.services.timeout(remote.name)
             remote.due = now + timeout
             known.routes[remote.route] = remote
+            self._opening.add(remote)
             self._out.arm_timer()
             self._out.send(remote.peer, OpenService(remote.route, remote.wire, timeout))
 
@@ -430,6 +433,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
             return
         if remote.requests:
             raise RemoteProtocolError(f"route {message.route} of {remote.wire} is opened twice")
+        self._opening.discard(remote)
         remote.requests, remote.problem = message.requests, ""
         remote.about = ServiceDescription(message.type, message.md5, message.request_type, message.response_type)
         self._out.opened(remote)
@@ -442,16 +446,12 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds; ``None``: no route is asked for."""
-        return min((remote.due for remote in self._asked_for()), default=None)
+        return min((remote.due for remote in self._opening), default=None)
 
     def handle_timer(self, now: float) -> None:
         """Give up the routes that the peers have not opened in time."""
-        for remote in [one for one in self._asked_for() if one.due <= now]:
+        for remote in [one for one in self._opening if one.due <= now]:
             self.release(remote, f"the agent of {self.peer_name(remote.peer)} does not answer")
-
-    def _asked_for(self) -> Iterator[RemoteService]:
-        """The services whose peers have not answered yet."""
-        return (one for known in self._peers.values() for one in known.routes.values() if not one.requests)
 
     def release(self, remote: RemoteService, reason: str) -> None:
         """Close the route of a service that is not needed now; the next call opens it again."""
@@ -462,6 +462,7 @@ class ServiceImports(ImportBook[str, RemoteService, ServiceOffer]):
 
     def _end(self, remote: RemoteService, reason: str) -> None:
         route = remote.route
+        self._opening.discard(remote)
         del self._peers[remote.peer].routes[route]
         remote.route, remote.requests, remote.problem = 0, 0, reason
         self._out.ended(remote, route, reason)

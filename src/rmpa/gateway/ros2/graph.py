@@ -112,8 +112,9 @@ class Ros2Graph:
         self._nodes: dict[str, Ros2Node] = {}
         self._endpoints: dict[str, Ros2Endpoint] = {}
         self._by_name: dict[str, dict[str, Ros2Endpoint]] = {}
-        # The nodes that other gateways show.
+        # The nodes that other gateways show, by token, and their tokens by name.
         self._rivals: dict[str, Ros2Node] = {}
+        self._rivals_of: dict[str, set[str]] = {}
         self.ignored: Counter[str] = Counter()
 
     @property
@@ -135,7 +136,7 @@ class Ros2Graph:
         Two gateways of one mesh would show each node twice, and each message would come twice. Of those that show a
         node the one with the least session id goes on.
         """
-        shown = (each.zid for each in self._rivals.values() if each.name == node)
+        shown = (self._rivals[key].zid for key in self._rivals_of.get(node, ()))
         return min((zid for zid in shown if _order(zid) < _order(self._own_zid)), key=_order, default="")
 
     def change(self, key: str, *, alive: bool) -> Ros2Node | Ros2Endpoint | None:
@@ -146,7 +147,12 @@ class Ros2Graph:
             changed.
         """
         if not alive:
-            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None) or self._rivals.pop(key, None)
+            gone = self._nodes.pop(key, None) or self._endpoints.pop(key, None)
+            if gone is None and (rival := self._rivals.pop(key, None)) is not None:
+                self._rivals_of[rival.name].remove(key)
+                if not self._rivals_of[rival.name]:
+                    del self._rivals_of[rival.name]
+                return rival
             if isinstance(gone, Ros2Endpoint):
                 del self._by_name[gone.name][key]
                 if not self._by_name[gone.name]:
@@ -167,6 +173,7 @@ class Ros2Graph:
             if reason != _OTHER_GATEWAY or node is not entity or len(self._rivals) >= limits.ROS2_NODES_MAX:
                 return None
             self._rivals[key] = node
+            self._rivals_of.setdefault(node.name, set()).add(key)
             return node
         if isinstance(entity, Ros2Node):
             self._nodes[key] = entity

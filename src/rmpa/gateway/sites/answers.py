@@ -323,7 +323,7 @@ class SiteAnswers:
         mine = KINDS[there.kind], module
         found = next((way for way in ways if (way.kind, way.peer) == mine and way.node in (there.node, "")), None)
         stages = [self._site_stage(site), *_told(site, module, there.name, found, refusal)]
-        found_here = self._sites.imported.get(entry.source) if entry is not None else None
+        found_here = self._sites.imported.get((entry.source, entry.announced.name)) if entry is not None else None
         here = [_refused_stage("here", refused, self._site)] if entry is None else here_stages(entry, found_here)
         unheard = next((at for at, stage in enumerate(stages) if stage.name == _DEMAND_THERE), None)
         wanted = isinstance(found_here, ImportedTopic) and found_here.wanted

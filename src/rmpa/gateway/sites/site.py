@@ -39,7 +39,7 @@ class SiteNeighbour:
         catalogue: What the other sites have.
         exports: What this site offers.
         imports: What is shown of the other sites.
-        imported: What runs for it, by what is shown.
+        imported: What runs for it, by what is shown and the name there: a rule may give several topics one name.
         leads: Whether this gateway is the one of its site that exports and imports.
         questions: Declare what it answers while it leads.
     """
@@ -54,7 +54,7 @@ class SiteNeighbour:
         self.catalogue = SiteCatalogue(own.site, self.imports, self._site_seen, context.counters)
         self.topics = SiteTopics(context)
         self.services = SiteServices(context)
-        self.imported: dict[ForeignSource, ImportedTopic | ImportedService] = {}
+        self.imported: dict[tuple[ForeignSource, str], ImportedTopic | ImportedService] = {}
         self.leads = False
         self.questions: list[Callable[[], Declaration]] = list(self.topics.questions)
         self._actions = SiteActions(context.graph)
@@ -180,15 +180,17 @@ class SiteNeighbour:
         if not self.leads or entry is None:
             return
         with logged_failure(_log, "%s failed; the other changes are made", entry):
-            source, topic = entry.source, entry.source.kind is SourceKind.TOPIC
+            source, topic, key = (
+                entry.source,
+                entry.source.kind is SourceKind.TOPIC,
+                (entry.source, entry.announced.name),
+            )
             if old is not None and new is not None:
-                self.imported[source].renew(new)
+                self.imported[key].renew(new)
                 return
             if new is None:
-                self.imported.pop(source).close()
+                self.imported.pop(key).close()
             else:
-                self.imported[source] = (
-                    ImportedTopic(new, self.topics) if topic else ImportedService(new, self.context)
-                )
+                self.imported[key] = ImportedTopic(new, self.topics) if topic else ImportedService(new, self.context)
             if topic:
                 self._actions.server(source, there=new is not None)

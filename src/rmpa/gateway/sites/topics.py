@@ -173,7 +173,7 @@ class ImportedTopic:
     # More than twelve fields: demand, header, and the counts of what was lost meanwhile change each other.
 
     def __init__(self, entry: SiteImport, part: SiteTopics) -> None:
-        now, interrupted = time.monotonic(), part.interrupted.pop(entry.source, None)
+        now, interrupted = time.monotonic(), part.interrupted.pop((entry.source, entry.announced.name), None)
         self.entry = entry
         self.wanted = False
         self._part = part
@@ -244,7 +244,7 @@ class ImportedTopic:
         """Take it out of the graph; its counts are kept for the same topic once it is back."""
         if self.wanted and not self._linger:
             kept = self._part.interrupted
-            kept[self.entry.source] = self._sequence, self.messages
+            kept[self.entry.source, self.entry.announced.name] = self._sequence, self.messages
             if len(kept) > limits.INTERRUPTED_TOPICS_MAX:
                 del kept[next(iter(kept))]
             self._sequence = SequenceCounter()
@@ -380,7 +380,7 @@ class SiteTopics:
         self.context = context
         # By module and topic, then by node and the site that it is for (empty: for all).
         self._exported: dict[tuple[str, str], dict[tuple[str, str], SiteExportedTopic]] = {}
-        self.interrupted: dict[ForeignSource, tuple[SequenceCounter, int]] = {}
+        self.interrupted: dict[tuple[ForeignSource, str], tuple[SequenceCounter, int]] = {}
         self._subscriptions: dict[str, _Subscription] = {}
         self._reader = AttachmentReader()
         self._headers = Answering("headers", f"the gateway of site {context.name} ends", limits.SITE_CALLS_WAITING)
