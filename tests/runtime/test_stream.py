@@ -154,7 +154,7 @@ async def test_a_failed_send_is_told_from_the_loop(sockets: Sockets) -> None:
 
 async def test_close_after_a_failed_send_is_silent(sockets: Sockets) -> None:
     one = End(sockets[0])
-    one.stream._lost(OSError())
+    one.stream.lost(OSError())
     one.stream.close()
     await asyncio.sleep(0)
     assert one.ends == []

@@ -220,9 +220,8 @@ class Demands(RuntimePart):
                 client = await self._undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
                 self._clients[demand.resource] = client
                 self._runtime.bind(demand, "on_change", self._request)
-                self._work.add(
-                    keep_task(functools.partial(self._follow, demand, client), f"follow {demand.resource}")
-                )
+                follow = functools.partial(self._follow, demand, client)
+                self._work.add(keep_task(follow, f"follow {demand.resource}"))
                 if demand.requests:
                     self._request(demand)
                 if self._runtime.resource.inputs:

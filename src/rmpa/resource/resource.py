@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 # The highest rate of a periodic task, in Hz.
 _RATE_MAX: Final = 10_000
+# Functions of rules that are about a node, without an argument about the only one.
+_OF_NODES: Final = ("cpu", "memory", "running")
 _Function = TypeVar("_Function", bound=Callable[..., object])
 # Names below a resource's node that are reserved for topics, services and parameters of every resource.
 RESERVED: Final = frozenset(
@@ -141,7 +143,7 @@ class Resource:
         """
         parsed = parse_expression(text, self.parameters, where, attributes=self.attributes)
         for source in parsed.sources.values():
-            if source.function not in ("cpu", "memory", "running"):
+            if source.function not in _OF_NODES:
                 continue
             if not source.arguments and len(self.nodes) != 1:
                 raise ConfigError(where, f"{source.function}() of which node?", f"there are {len(self.nodes)}")
@@ -423,12 +425,9 @@ class Resource:
         if any(other.name == made.name for other in self.nodes.values()) or made.name == f"/{self.name}":
             raise ConfigError(where, f"{made.name} is declared already, or the resource itself", "name it once")
         for (kind, owner, _), rule in self.expressions() if len(self.nodes) == 1 else ():
-            if any(
-                one.function in ("cpu", "memory", "running") and not one.arguments for one in rule.sources.values()
-            ):
-                raise ConfigError(
-                    where, f"{kind} {owner} has a rule that names no node: {rule}", "name the node there"
-                )
+            if any(one.function in _OF_NODES and not one.arguments for one in rule.sources.values()):
+                problem = f"{kind} {owner} has a rule that names no node: {rule}"
+                raise ConfigError(where, problem, "name the node there")
         self.nodes[key] = made
         return made
 

@@ -180,11 +180,8 @@ class SiteNeighbour:
         if not self.leads or entry is None:
             return
         with logged_failure(_log, "%s failed; the other changes are made", entry):
-            source, topic, key = (
-                entry.source,
-                entry.source.kind is SourceKind.TOPIC,
-                (entry.source, entry.announced.name),
-            )
+            source, key = entry.source, (entry.source, entry.announced.name)
+            topic = source.kind is SourceKind.TOPIC
             if old is not None and new is not None:
                 self.imported[key].renew(new)
                 return
