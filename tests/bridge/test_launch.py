@@ -146,6 +146,9 @@ async def test_the_next_agent_takes_over_what_a_killed_one_had_started(
     second.part.start()
     assert (await second.wait("cam", "active")).pid == pids["cam"]
     assert (await second.one("gone")).state == "stopped"
+    mark = second.part._launched["gone"].mark
+    assert mark is not None, "the nodes that it left are found by it"
+    assert mark.pid == pids["gone"]
     assert (await second.do("start", "cam")).resources[0].pid == pids["cam"]
     os.kill(pids["cam"] or 0, signal.SIGKILL)
     await until(lambda: figures(pids["cam"] or 0) is None)

@@ -65,7 +65,8 @@ class MemoryTopic:
         self.messages.append(b"forgotten")
 
     def close(self) -> None:
-        self.graph.topics.pop((self.source.name, self.source.node))
+        if self.graph.topics.get((self.source.name, self.source.node)) is self:  # a rule may give another one its name
+            del self.graph.topics[self.source.name, self.source.node]
 
 
 @dataclass(eq=False)

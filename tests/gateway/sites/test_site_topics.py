@@ -164,6 +164,18 @@ async def test_another_gateway_takes_over_and_the_other_site_keeps_its_topics(be
     assert hall.topic("/scan") is topic, "a takeover must not take the topic down and up"
 
 
+async def test_two_topics_of_one_node_that_a_rule_gives_one_name_come_and_go(
+    bed: SiteBed, caplog: pytest.LogCaptureFixture
+) -> None:
+    yard, hall = await bed.site("yard"), await bed.site("hall", rules=(CrossingRule(name="/pose"),))
+    sources = [yard.graph.add(name, described()) for name in ("/odom", "/fused")]
+    await eventually(lambda: len(hall.neighbour.imported) == 2)
+    for source in sources:
+        yard.graph.remove(source)
+    await eventually(lambda: not hall.neighbour.imported)
+    assert "failed" not in caplog.text
+
+
 async def test_a_definition_is_answered_by_its_md5_sum(bed: SiteBed) -> None:
     yard, hall = await bed.pair()
     yard.graph.add("/odd", described())

@@ -12,6 +12,7 @@ from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
+from rmpa.ros.wire.xmlrpc import RosFault
 from tests.ros.node.peers import STRING, node
 from tests.waiting import DEADLINE, until
 
@@ -373,6 +374,19 @@ async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
             await one.close()
     assert begun == ["system.multicall"]
     assert one.stopped.is_set()
+
+
+async def test_a_node_unregisters_at_a_master_without_multicall(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def lacks(_uri: str, method: str, *_params: Any) -> Any:
+        raise RosFault(-1, f"there is no {method}")
+
+    async with node(core, "n") as one:
+        await one.advertise("/out", "std_msgs/String")
+        await one.subscribe("/in", "std_msgs/String")
+        monkeypatch.setattr("rmpa.ros.node.endpoints.call", lacks)
+    assert not {"/out", "/in"} & {*core.state().publishers, *core.state().subscribers}
 
 
 async def test_a_service_is_served_and_called(core: RosCore) -> None:

@@ -126,6 +126,18 @@ async def test_silent_connection_blocks_no_other_and_is_closed(
     assert served.publication.subscribers == 1
 
 
+async def test_a_connection_that_its_topic_cannot_take_is_closed(
+    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(_connection: object) -> None:
+        raise RuntimeError("a callback fails")
+
+    monkeypatch.setattr(served.publication, "attach", fails)
+    link = await RawSubscriber.connect(served.address)
+    assert await link.ended()
+    assert "a callback fails" in caplog.text
+
+
 async def test_connections_without_a_header_are_bounded(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKES_MAX", 3)
     links = [await RawSubscriber.dial(served.address) for _ in range(4)]
