@@ -65,7 +65,7 @@ class MemoryTopic:
         self.messages.append(b"forgotten")
 
     def close(self) -> None:
-        if self.graph.topics.get((self.source.name, self.source.node)) is self:  # a rule may give another one its name
+        if self.graph.topics.get((self.source.name, self.source.node)) is self:  # another may have its name
             del self.graph.topics[self.source.name, self.source.node]
 
 
