@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 
 import click
 import pytest
@@ -182,7 +182,7 @@ printf '%s\\n' "${COMPREPLY[@]}"
 
 
 @pytest.fixture
-def joystick(agent: Callable[..., None], core: RosCore, listening: str) -> Iterator[None]:
+async def joystick(agent: Callable[..., None], core: RosCore, listening: str) -> AsyncIterator[None]:
     """An agent whose core has a topic of peer joystick."""
     agent(snapshot=with_core(core.uri))
     assert core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", listening).code == 1

@@ -1,6 +1,6 @@
 """The protocol of the control socket, its client, and the search for this machine's agents.
 
-The protocol of the control socket: one JSON object a line each way.
+One JSON object a line each way.
 
 ::
 

@@ -1,7 +1,8 @@
 """A program that the agent keeps running: it is started again when it ends, and taken over from an agent before.
 
 An agent that ends in order ends its programs. One that is killed leaves them, with their clients, to the next one: a
-file notes the process of each.
+file notes the process of each. One that is killed within the milliseconds between start and note leaves a program of
+which no agent knows.
 """
 
 from __future__ import annotations

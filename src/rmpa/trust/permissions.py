@@ -194,7 +194,7 @@ def _first(globs: tuple[str, ...], name: str) -> str | None:
     return next((glob for glob in globs if matches(glob, name)), None)
 
 
-# How signed documents reach every module: ``agent.trust.AgentTrust`` sends each peer those that it lacks.
+# How signed documents reach every module: each peer is sent those that it lacks.
 
 
 class Document(StrEnum):

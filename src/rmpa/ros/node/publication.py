@@ -41,7 +41,7 @@ def _ended(*_: object) -> None:
 
 
 class AcceptedConnection(Stream):
-    """A connection that another node opened to a node of this process: a header comes, then messages or replies go.
+    """A connection that another node opened to a node of this process, whose header has come: messages or replies go.
 
     Args:
         sock: Accepted, non-blocking; owned from here on.
