@@ -142,9 +142,7 @@ class Resource:
             ConfigError: It is invalid, or names a node that is not declared; ``where`` begins the error's text.
         """
         parsed = parse_expression(text, self.parameters, where, attributes=self.attributes)
-        for source in parsed.sources.values():
-            if source.function not in _OF_NODES:
-                continue
+        for source in [one for one in parsed.sources.values() if one.function in _OF_NODES]:
             if not source.arguments and len(self.nodes) != 1:
                 raise ConfigError(where, f"{source.function}() of which node?", f"there are {len(self.nodes)}")
             declare.check_known("node", source.arguments[:1], self.nodes, where)
