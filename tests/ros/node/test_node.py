@@ -9,6 +9,7 @@ import pytest
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.http.rpc import call
 from rmpa.ros.node.node import Node, Received
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.messages import MessageError, MessageType
@@ -379,13 +380,15 @@ async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
 async def test_a_node_unregisters_at_a_master_without_multicall(
     core: RosCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def lacks(_uri: str, method: str, *_params: Any) -> Any:
-        raise RosFault(-1, f"there is no {method}")
+    async def lacking(uri: str, method: str, *params: Any) -> Any:
+        if method == "system.multicall":
+            raise RosFault(-1, f"there is no {method}")
+        return await call(uri, method, *params)
 
     async with node(core, "n") as one:
         await one.advertise("/out", "std_msgs/String")
         await one.subscribe("/in", "std_msgs/String")
-        monkeypatch.setattr("rmpa.ros.node.endpoints.call", lacks)
+        monkeypatch.setattr("rmpa.ros.node.endpoints.call", lacking)
     assert not {"/out", "/in"} & {*core.state().publishers, *core.state().subscribers}
 
 

@@ -152,19 +152,16 @@ class MasterClient:
     async def _unregister_all(self) -> None:
         """Unregister everything in one call, with one deadline for a slow master."""
         self._ended = True
-        calls = [
-            one_call(f"unregister{entry.kind_name}", (self.name, entry.key, entry.uri)) for entry in self._entries
-        ]
-        calls += [one_call("unsubscribeParam", (self.name, self.uri, key)) for key in self._followed]
+        calls = [(f"unregister{entry.kind_name}", (self.name, entry.key, entry.uri)) for entry in self._entries]
+        calls += [("unsubscribeParam", (self.name, self.uri, key)) for key in self._followed]
         try:
             async with asyncio.timeout(NODE_UNREGISTER_TIMEOUT):
                 if calls:
                     try:
-                        await call(self.master_uri, "system.multicall", calls)
+                        await call(self.master_uri, "system.multicall", [one_call(*each) for each in calls])
                     except RosFault:  # a master that lacks it
-                        each = [(f"unregister{entry.kind_name}", entry.key, entry.uri) for entry in self._entries]
-                        each += [("unsubscribeParam", self.uri, key) for key in self._followed]
-                        await asyncio.gather(*(self.call_master(*one) for one in each), return_exceptions=True)
+                        for method, params in calls:
+                            await call(self.master_uri, method, *params)
                 await asyncio.gather(*self._unregistering)
         except (RmpaError, TimeoutError) as error:
             _log.debug("! %s: not everything is unregistered at %s: %s", self.name, self.master_uri, error)
