@@ -376,8 +376,8 @@ _ADDRESS: Final = re.compile(
     r"(?<![\w.])(?:\d{1,3}\.){3}\d{1,3}(?![\w.])|(?<![\w:])[0-9a-fA-F]{0,4}(?::[0-9a-fA-F]{0,4}){2,7}(?![\w:])"
 )
 _MAC: Final = re.compile(r"(?<![\w:])(?:[0-9a-fA-F]{2}:){5}[0-9a-fA-F]{2}(?![\w:])")
-# Users' names that name no person: that of a service, or of many images.
-_NO_PERSON: Final = frozenset({"root", "rmpa", "nobody", "user", "admin", "pi", "ubuntu", "ros", "robot"})
+# Names of accounts that tell nothing of a person: of services, and of many images.
+_COMMON_ACCOUNTS: Final = frozenset({"root", "rmpa", "nobody", "user", "admin", "pi", "ubuntu", "ros", "robot"})
 
 
 class Redactor:
@@ -399,7 +399,7 @@ class Redactor:
             *_RULES,
             ("home directories", _any_of(home for home in homes if home not in ("", "/")), "~"),
             ("home directories", _HOME, "~"),
-            ("user names", _words(user for user in users if user not in _NO_PERSON), "[user]"),
+            ("user names", _words(user for user in users if user not in _COMMON_ACCOUNTS), "[user]"),
         ]
         self.counts: Counter[str] = Counter()
         self.aliases: dict[str, str] = {}

@@ -131,7 +131,7 @@ class ChannelTable:
         services: Whether clients may call services; else they are offered none.
     """
 
-    # More than 12 fields: what is offered, what is known of its types, and who is told.
+    # More than 12 fields: what is offered, what is known of its types, and the sessions that follow.
     def __init__(self, hub: Hub, server: str, *, services: bool) -> None:
         self.server = server
         # The id of this run of the server.

@@ -193,7 +193,7 @@ class _Shared(Generic[_User]):
                 each.failed(error)
 
     def end(self) -> None:
-        """End it, whoever uses it."""
+        """Unregister it, also while clients use it."""
         self._keep()
         del self._table[self.name]
         self.registration.end()

@@ -197,7 +197,7 @@ class Driver:
         self._publication.publish(self._codec.write(values, self._time.now_ns()).payload)
 
 
-# Who has the stick of a driven topic: one page of one module at a time, known to all that show its joystick. Servers
+# The holder of a driven topic: one page of one module at a time, known to all that show its joystick. Servers
 # tell each other by the topic ``TOPIC/holder``, so that it is renamed, permitted and recorded as ``TOPIC`` is. A
 # ``Hold`` is said anew every ``limits.STICK_RENEW`` while it lasts; one that is not heard for ``limits.STICK_EXPIRY``
 # has ended. Each taking has a higher ``turn`` than what was known, and of two at one moment the higher ``id`` holds:
