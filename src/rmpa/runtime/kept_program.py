@@ -12,11 +12,11 @@ import contextlib
 import logging
 import time
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import msgspec
 
-from rmpa.runtime.programs import ProgramMark, end_program, ended, how_ended, replace_file
+from rmpa.runtime.programs import ProgramMark, RunFile, end_program, ended, how_ended, replace_file
 from rmpa.runtime.tasks import end_tasks, keep_task, start_task
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _USAGE: Final = 2
 _STEADY: Final = 60.0
 
 
-class ProgramNote(msgspec.Struct, frozen=True):
+class ProgramNote(RunFile, frozen=True):
     """What the file of a program has for the next agent.
 
     Attributes:
@@ -44,14 +44,6 @@ class ProgramNote(msgspec.Struct, frozen=True):
     mark: ProgramMark
     made_of: tuple[str, ...]
     restarts: int = 0
-
-    @classmethod
-    def load(cls, path: Path) -> Self | None:
-        """Read a file; ``None``: there is none, or it is of another release."""
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=cls)
-        except (OSError, msgspec.DecodeError):
-            return None
 
 
 class KeptProgram(ABC):

@@ -191,7 +191,19 @@ class NodeRun(msgspec.Struct, frozen=True, kw_only=True):
     why: str = ""
 
 
-class ResourceRun(msgspec.Struct, frozen=True, kw_only=True):
+class RunFile(msgspec.Struct, frozen=True):
+    """What a program has in a file for those that come after it."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self | None:
+        """Read a file; ``None``: there is none, or it is of another release."""
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError):
+            return None
+
+
+class ResourceRun(RunFile, frozen=True, kw_only=True):
     """What a resource tells of itself in a file, to the next run of it and to the agent.
 
     Attributes:
@@ -203,14 +215,6 @@ class ResourceRun(msgspec.Struct, frozen=True, kw_only=True):
     process: ProgramMark
     state: str
     nodes: tuple[NodeRun, ...] = ()
-
-    @classmethod
-    def load(cls, path: Path) -> Self | None:
-        """Read a file; ``None``: there is none, or it is of another release."""
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=cls)
-        except (OSError, msgspec.DecodeError):
-            return None
 
     def save(self, path: Path) -> None:
         """Replace a file.
